@@ -1,0 +1,1 @@
+"""The verbs of `robotctl`, one small file each."""

@@ -1,0 +1,1 @@
+"""The fixed-rate loop, and the processes and shared memory around it."""

@@ -1,0 +1,89 @@
+"""Pinocchio kinematics and dynamics of an arm, without allocation where the tick uses it."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from robotctl.hal.errors import ConfigError
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Vector
+
+
+class Kinematics:
+    """The arm's model with the gripper's joints locked half open. All vectors in the order of the profile's joints.
+
+    Frames: positions and Jacobians are of the tool point, in the base frame.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Build the model.
+
+        Raises:
+            ConfigError: if the model's joints or frames are not those of the profile.
+        """
+        profile = robot.profile
+        full = build_model(robot)
+        names = [joint.name for joint in profile.joints]
+        fingers = {finger.name: finger for finger in profile.gripper.fingers} if profile.gripper else {}
+        others = [name for name in full.names if name != "universe" and name not in names]
+        reference = pin.neutral(full)
+        for name in others:
+            if name in fingers:
+                finger = fingers[name]
+                reference[full.joints[full.getJointId(name)].idx_q] = 0.5 * (finger.closed + finger.open)
+        self.model = pin.buildReducedModel(full, [full.getJointId(name) for name in others], reference)
+        if [name for name in self.model.names if name != "universe"] != names:
+            raise ConfigError(f"{robot.source}: joints must be listed in the model's order: {list(self.model.names)[1:]}")
+        if not self.model.existFrame(profile.tool_frame):
+            raise ConfigError(f"{robot.source}: tool_frame {profile.tool_frame!r} is not in the model")
+        carrier = self.model.frames[self.model.getFrameId(profile.tool_frame)]
+        placement = carrier.placement * pin.SE3(np.eye(3), np.array(profile.tool_offset))
+        tool = pin.Frame("robotctl_tool", carrier.parentJoint, carrier.parentFrame, placement, pin.FrameType.OP_FRAME)
+        self._tool = self.model.addFrame(tool)
+        self._data = self.model.createData()
+        self._aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        self.damping = np.array(self.model.damping)
+        """Viscous friction of each joint, Nms/rad."""
+        self.friction = np.array(self.model.friction)
+        """Dry friction of each joint, Nm."""
+
+    def tool(self, position: Vector) -> Vector:
+        """Return the tool point (3,), m."""
+        pin.forwardKinematics(self.model, self._data, position)
+        return np.array(pin.updateFramePlacement(self.model, self._data, self._tool).translation)
+
+    def tool_and_jacobian(self, position: Vector) -> tuple[Vector, Vector]:
+        """Return the tool point (3,) and its translational Jacobian (3, n), m/rad."""
+        jacobian = pin.computeFrameJacobian(self.model, self._data, position, self._tool, self._aligned)
+        return np.array(self._data.oMf[self._tool].translation), jacobian[:3]
+
+    def pose_and_jacobian(self, position: Vector) -> tuple[pin.SE3, Vector]:
+        """Return the tool's pose and its Jacobian (6, n): linear rows first."""
+        jacobian = pin.computeFrameJacobian(self.model, self._data, position, self._tool, self._aligned)
+        return pin.SE3(self._data.oMf[self._tool]), jacobian
+
+    def inverse_dynamics(self, position: Vector, velocity: Vector, acceleration: Vector) -> Vector:
+        """Return the torques (n,) of a motion, Nm, without friction."""
+        return np.array(pin.rnea(self.model, self._data, position, velocity, acceleration))
+
+    def gravity(self, position: Vector) -> Vector:
+        """Return the torques (n,) that hold the arm still, Nm."""
+        return np.array(pin.computeGeneralizedGravity(self.model, self._data, position))
+
+    def mass_matrix(self, position: Vector) -> Vector:
+        """Return the joint-space inertia (n, n), kg m^2."""
+        upper = np.triu(pin.crba(self.model, self._data, position))
+        return np.array(upper + np.triu(upper, 1).T)
+
+
+def build_model(robot: Robot) -> pin.Model:
+    """Return Pinocchio's model of the whole description, gripper included."""
+    description = robot.description
+    if description.format == "urdf":
+        return pin.buildModelFromXML(description.xml)
+    with tempfile.TemporaryDirectory() as folder:  # Pinocchio's MJCF reader takes files only
+        path = Path(folder) / "model.xml"
+        path.write_text(description.xml)
+        return pin.buildModelFromMJCF(str(path))

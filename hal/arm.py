@@ -1,0 +1,95 @@
+"""The interfaces that every robot fulfils, and that `tests/contract` holds it to.
+
+Life of an arm: `connect` -> `verify` -> `enable` -> (`read`, `write`)* -> `hold` -> `disable` -> `close`.
+"""
+
+from abc import ABC, abstractmethod
+from types import TracebackType
+from typing import Self
+
+from robotctl.hal.types import Command, GripperSample, Sample, Sent, Truth
+
+
+class Arm(ABC):
+    """A serial arm of n joints. `read` and `write` never block for longer than one servo period.
+
+    Raises:
+        HardwareError: from `connect`, `verify`, `enable` and `disable`. `read` and `write` raise it only
+            when the bus itself is gone; what a single drive lacks shows in the sample's stamps and faults.
+    """
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Open what has to be opened. On return nothing has been sent."""
+
+    @abstractmethod
+    def verify(self) -> None:
+        """Read back from every drive what it is, and refuse what the profile does not say. Enables nothing."""
+
+    @abstractmethod
+    def enable(self) -> None:
+        """Enable every drive, holding the measured pose on return. Harmless when already enabled.
+
+        Does not clear faults: a faulty drive makes it raise.
+        """
+
+    @abstractmethod
+    def read(self) -> Sample:
+        """Return the latest sample. Joints that were not heard of keep their old stamp."""
+
+    @abstractmethod
+    def write(self, command: Command) -> Sent:
+        """Send one command to every joint, and return what was really sent."""
+
+    @abstractmethod
+    def hold(self) -> Sent:
+        """Ask the drives to hold the measured pose."""
+
+    @abstractmethod
+    def disable(self) -> None:
+        """Take the torque away from every drive. Resent until confirmed; raises if a drive never confirms."""
+
+    @abstractmethod
+    def clear_faults(self) -> None:
+        """Clear the drives' faults. Enables nothing."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release everything. Harmless when already closed. Does not move or disable anything by itself."""
+
+    def truth(self) -> Truth | None:
+        """Return the true state of the plant behind this arm, or None where only measurements exist."""
+        return None
+
+    def bus_statistics(self) -> dict[str, object] | None:
+        """Return counters of the bus (sent, received, missed replies, round trips), or None without a bus."""
+        return None
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Gripper(ABC):
+    """A gripper of its own: metres and newtons. No call waits for it to move."""
+
+    @abstractmethod
+    def command(self, width: float, force: float) -> None:
+        """Ask for an opening of `width` metres with at most `force` newtons. Returns at once.
+
+        Raises:
+            ValueError: if a value is not finite or outside the profile's range.
+        """
+
+    @abstractmethod
+    def read(self) -> GripperSample:
+        """Return the latest sample."""
+
+    @abstractmethod
+    def step(self) -> None:
+        """Do what is due on the bus. The loop calls it once in every tick."""

@@ -1,0 +1,1 @@
+"""CAN: channels, transport, wire protocols and the drivers on top."""

@@ -1,0 +1,1 @@
+"""DAMIAO drives (DM-J43xx, DM-80xx and relatives)."""

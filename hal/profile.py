@@ -1,0 +1,235 @@
+"""The robot profile: a frozen, strict data model of one robot, in SI units.
+
+Everything that depends on the robot stands here and nowhere else. Unknown keys, missing keys, NaN and infinities
+are refused. The files are `configs/robots/*.yaml`; `robotctl.hal.robot` loads them and checks them against the model.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
+NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
+Point = tuple[Finite, Finite, Finite]
+Range = tuple[Finite, Finite]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class ModelSource(_Strict):
+    """Where the robot's URDF or MJCF comes from."""
+
+    package: str = ""
+    """Distribution that ships the file, or empty for a path of your own."""
+    file: str
+    """Path, or the end of the path inside the distribution."""
+    root: str | None = None
+    """MJCF only: the body under `worldbody` that carries the arm."""
+
+
+class Drive(_Strict):
+    """Which motor moves a joint, and how its angle maps to the joint's.
+
+    motor angle = sign * gear * (joint angle - offset)
+    """
+
+    id: Annotated[int, Field(ge=1, le=0x7F)]
+    """ESC_ID, the id the motor listens to."""
+    reply_id: Annotated[int, Field(ge=1, le=0x7FF)]
+    """MST_ID, the id it answers with."""
+    motor: str
+    """Model, e.g. DM8009; its full-scale ranges are verified against the drive."""
+    sign: Literal[-1, 1] = 1
+    gear: Positive = 1.0
+    """Motor turns per joint turn, beyond the gear that the drive itself accounts for."""
+    offset: Finite = 0.0
+    """Joint angle at the motor's zero, rad."""
+
+
+class Gains(_Strict):
+    """Drive-side tracking gains, and the host's slow correction for what the model does not know."""
+
+    kp: NotNegative
+    """Nm/rad"""
+    kd: NotNegative
+    """Nms/rad"""
+    ki: NotNegative = 0.0
+    """Nm/(rad s), applied by the host"""
+
+
+class Joint(_Strict):
+    """One joint, with the limits the arm is held to. They may be tighter than the model's, never wider."""
+
+    name: str
+    """Name in the model file."""
+    position: Range
+    """Soft limits, rad."""
+    velocity: Positive
+    """rad/s"""
+    acceleration: Positive
+    """rad/s^2"""
+    jerk: Positive
+    """rad/s^3"""
+    torque: Positive
+    """Nm"""
+    torque_rate: Positive
+    """Nm/s"""
+    gains: Gains
+    drive: Drive | None = None
+    """None for an arm without CAN drives."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Joint":
+        if self.position[0] >= self.position[1]:
+            raise ValueError(f"position: lower limit {self.position[0]} is not below the upper {self.position[1]}")
+        return self
+
+
+class Finger(_Strict):
+    """One finger joint of the model, and its coordinate at both ends of the stroke."""
+
+    name: str
+    closed: Finite
+    """rad or m"""
+    open: Finite
+
+
+class GripperProfile(_Strict):
+    """A parallel gripper."""
+
+    fingers: list[Finger]
+    width: Positive
+    """Opening when fully open, m; 0 when closed."""
+    force: Positive
+    """Largest grip force, N."""
+    speed: Positive
+    """Opening speed, m/s."""
+    gains: Gains
+    """Of the first finger's joint; the others follow it."""
+    drive: Drive | None = None
+    """Gripper motor. Its `offset` is unused."""
+    motor_open: Finite = 1.0
+    """Motor angle when fully open, rad; 0 when closed."""
+
+
+class Sphere(_Strict):
+    """The ball that the tool point may not leave, in the base frame."""
+
+    centre: Point
+    """m"""
+    radius: Positive
+    """m"""
+
+
+class Safety(_Strict):
+    """Thresholds of the protections. Every default is on."""
+
+    sphere: Literal["qp", "projection"] = "qp"
+    """How the sphere bounds a command: as a row of the QP, or by the projection rule of Gu et al. 2017."""
+    sphere_gain: Positive = 5.0
+    """Largest approach speed per metre of distance left, 1/s. At most 1/(4 (lag + delay)) of the actuators."""
+    sphere_margin: NotNegative = 0.002
+    """Kept free inside the sphere, m; covers the tracking error."""
+    sphere_breach: Positive = 0.010
+    """Measured distance outside at which the arm is stopped, m."""
+    position_margin: NotNegative = 0.002
+    """Kept free inside each soft limit, rad; covers the tracking error."""
+    position_breach: Positive = 0.0087
+    """Measured distance past a soft limit at which the arm is stopped, rad (0.5 degrees)."""
+    cap_margin: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.03
+    """Fraction of the velocity and acceleration caps that commands leave unused; covers the tracking error."""
+    tracking_error: Positive = 0.15
+    """Distance between reference and measurement at which the arm is stopped, rad."""
+    heartbeat_s: Positive = 0.1
+    """Time without a fresh target after which the arm brakes."""
+    heartbeat_grace_s: Positive = 0.5
+    """Time within which a policy that comes back may go on; later the stop is latched."""
+    malformed_window_s: Positive = 1.0
+    """Three malformed targets within this time are a fault."""
+    feedback_stop_s: Positive = 0.010
+    """Age of a joint's feedback above which the reference is braked to rest."""
+    feedback_fault_s: Positive = 0.050
+    """Age of a joint's feedback above which the arm is stopped for good."""
+    drive_timeout_s: Positive = 0.1
+    """Longest watchdog timeout a drive may report; without one it is refused."""
+    standstill: Positive = 0.02
+    """Measured joint speed below which a joint counts as at rest, rad/s."""
+    reset_scale: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
+    """Fraction of the velocity caps that reset routines may use."""
+    reset_tool_speed: Positive = 0.25
+    """Tool speed during reset routines, m/s."""
+
+
+class CanBus(_Strict):
+    """How the drives are wired."""
+
+    protocol: Literal["damiao"] = "damiao"
+    fd: bool = True
+    """CAN FD with bit-rate switch, else classic CAN."""
+    bitrate: int = 1_000_000
+    data_bitrate: int = 5_000_000
+
+
+class Twin(_Strict):
+    """Imperfections of the simulated arm."""
+
+    lag_s: NotNegative = 0.0
+    """Time constant with which the drives follow a command."""
+    delay_s: NotNegative = 0.0
+    """Dead time of a command on its way to the drives."""
+    noise_position: NotNegative = 0.0
+    """Standard deviation of measured positions, rad."""
+    noise_velocity: NotNegative = 0.0
+    """Standard deviation of measured velocities, rad/s."""
+    payload: NotNegative = 0.0
+    """Mass at the tool that the controller is not told of, kg."""
+
+
+class RobotProfile(_Strict):
+    """One robot."""
+
+    name: str
+    title: str
+    """One line for people."""
+    model: ModelSource
+    tool_frame: str
+    """Frame (link, body or site) that carries the tool."""
+    tool_offset: Point = (0.0, 0.0, 0.0)
+    """The tool point in that frame, m."""
+    servo_hz: Annotated[int, Field(ge=50, le=1000)] = 500
+    brakes: bool
+    """Whether the joints lock when the drives are off."""
+    category0: Literal["disable", "damp"]
+    """What a category 0 stop does: cut the torque, or damp with gravity compensated (arms without brakes)."""
+    home: list[Finite]
+    """Where episodes start, rad."""
+    rest: list[Finite]
+    """Where the arm is parked before its drives are switched off, rad."""
+    joints: list[Joint]
+    gripper: GripperProfile | None = None
+    sphere: Sphere
+    safety: Safety = Safety()
+    can: CanBus | None = None
+    twin: Twin = Twin()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "RobotProfile":
+        for key in ("home", "rest"):
+            pose = getattr(self, key)
+            if len(pose) != len(self.joints):
+                raise ValueError(f"{key}: {len(pose)} values for {len(self.joints)} joints")
+            for value, joint in zip(pose, self.joints, strict=True):
+                if not joint.position[0] < value < joint.position[1]:
+                    raise ValueError(f"{key}: {joint.name} at {value} rad is outside its limits {joint.position}")
+        ids = [joint.drive.id for joint in self.joints if joint.drive]
+        if self.gripper and self.gripper.drive:
+            ids.append(self.gripper.drive.id)
+        twice = {motor for motor in ids if ids.count(motor) > 1}
+        if twice:
+            raise ValueError(f"drive.id: {sorted(twice)} used by more than one motor")
+        if self.can and any(joint.drive is None for joint in self.joints):
+            raise ValueError("can: set, but not every joint has a drive")
+        return self

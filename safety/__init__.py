@@ -1,0 +1,1 @@
+"""What may reach a motor: state machine, admission, limits, shaper, reset routines."""

@@ -1,0 +1,1 @@
+"""The MuJoCo twin: plant, backend, and emulated motors that speak the wire."""

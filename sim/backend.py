@@ -1,0 +1,178 @@
+"""The MuJoCo backend: commands reach the plant's drives directly, without a bus."""
+
+from collections import deque
+
+import numpy as np
+
+from robotctl.hal.arm import Arm, Gripper
+from robotctl.hal.backend import Rig
+from robotctl.hal.clock import Clock
+from robotctl.hal.errors import ConfigError, HardwareError
+from robotctl.hal.profile import GripperProfile
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Command, CommandMode, GripperSample, Sample, Sent, Truth
+from robotctl.sim.plant import Plant
+
+
+def open_sim(robot: Robot, clock: Clock, channel: str = "") -> Rig:
+    """Return the twin of a robot. Entry point `sim` of the group `robotctl.backends`."""
+    if channel:
+        raise ConfigError(f"the sim backend has no channel, got {channel!r}", "use --backend can, or drop --channel")
+    plant = Plant(robot, clock.now_ns())
+    arm = SimArm(robot, plant, clock)
+    gripper = SimGripper(robot.profile.gripper, plant, clock) if robot.profile.gripper else None
+    return Rig(arm, gripper)
+
+
+class SimArm(Arm):
+    """An arm in MuJoCo, with the lag, delay, noise and payload of the profile's `twin`."""
+
+    def __init__(self, robot: Robot, plant: Plant, clock: Clock, seed: int = 0) -> None:
+        self._plant = plant
+        self._clock = clock
+        self._twin = robot.profile.twin
+        self._rng = np.random.default_rng(seed)
+        gains = [joint.gains for joint in robot.profile.joints]
+        self._kp = np.array([gain.kp for gain in gains])
+        self._kd = np.array([gain.kd for gain in gains])
+        self._none = np.zeros(robot.dof)
+        self._delay_ns = round(self._twin.delay_s * 1e9)
+        self._noisy = self._twin.noise_position > 0.0 or self._twin.noise_velocity > 0.0
+        self._waiting: deque[tuple[int, Command]] = deque()
+        self._stamps = np.zeros(robot.dof, dtype=np.int64)
+        self._connected = False
+        self._enabled = False
+
+    def connect(self) -> None:
+        self._connected = True
+
+    def verify(self) -> None:
+        self._require_connected()
+
+    def enable(self) -> None:
+        self._require_connected()
+        if not self._enabled:
+            self._plant.advance(self._clock.now_ns())
+            self._enabled = True
+            self._apply(self._holding())
+            for axis in range(self._plant.dof):
+                self._plant.settle_lag(axis)
+
+    def read(self) -> Sample:
+        self._require_connected()
+        now = self._clock.now_ns()
+        self._deliver(now)
+        truth = self._plant.truth()
+        position, velocity = truth.position, truth.velocity
+        if self._noisy:
+            position = position + self._rng.normal(0.0, self._twin.noise_position, position.shape)
+            velocity = velocity + self._rng.normal(0.0, self._twin.noise_velocity, velocity.shape)
+        stamps = self._stamps
+        stamps[:] = now
+        return Sample(now, position, velocity, truth.effort, stamps, (), self._enabled)
+
+    def write(self, command: Command) -> Sent:
+        if not self._enabled:
+            return Sent(command, "drives are off")
+        if self._delay_ns:
+            self._waiting.append((self._clock.now_ns() + self._delay_ns, command))
+        else:
+            self._apply(command)
+        return Sent(command)
+
+    def hold(self) -> Sent:
+        return self.write(self._holding())
+
+    def disable(self) -> None:
+        self._waiting.clear()
+        self._enabled = False
+        self._plant.advance(self._clock.now_ns())
+        for axis in range(self._plant.dof):
+            self._plant.release(axis)
+
+    def clear_faults(self) -> None:
+        self._require_connected()
+
+    def close(self) -> None:
+        self._connected = False
+
+    def truth(self) -> Truth:
+        return self._plant.truth()
+
+    def _holding(self) -> Command:
+        position = self._plant.truth().position
+        # An ideal drive's own integrator would find this effort; here the plant knows it.
+        gravity = self._plant.data.qfrc_bias[: self._plant.dof].copy()
+        return Command(CommandMode.TRACK, position, self._none, gravity)
+
+    def _deliver(self, now: int) -> None:
+        while self._waiting and self._waiting[0][0] <= now:
+            due, command = self._waiting.popleft()
+            self._plant.advance(due)
+            self._apply(command)
+        self._plant.advance(now)
+
+    def _apply(self, command: Command) -> None:
+        match command.mode:
+            case CommandMode.TRACK:
+                kp, kd = self._kp, self._kd
+            case CommandMode.EFFORT:
+                kp, kd = self._none, self._none
+            case CommandMode.DAMP:
+                kp, kd = self._none, self._kd
+        velocity = command.velocity if command.mode is CommandMode.TRACK else self._none
+        self._plant.drive_arm(kp, kd, command.position, velocity, command.effort)
+
+    def _require_connected(self) -> None:
+        if not self._connected:
+            raise HardwareError("the arm is not connected", "call connect() first")
+
+
+class SimGripper(Gripper):
+    """A gripper in MuJoCo: its fingers go to the commanded width at the profile's speed."""
+
+    def __init__(self, profile: GripperProfile, plant: Plant, clock: Clock) -> None:
+        self._profile = profile
+        self._plant = plant
+        self._clock = clock
+        self._axis = plant.dof
+        self._target: float | None = None
+        self._reference = 0.0
+        self._stepped_ns = 0
+
+    def command(self, width: float, force: float) -> None:
+        check_grip(self._profile, width, force)
+        if self._target is None:
+            self._reference = self.read().width
+            self._stepped_ns = self._clock.now_ns()
+        self._target = width
+
+    def read(self) -> GripperSample:
+        finger = self._profile.fingers[0]
+        state = self._plant.axis(self._axis)
+        width = self._profile.width * (state.position - finger.closed) / (finger.open - finger.closed)
+        return GripperSample(self._clock.now_ns(), width, abs(state.effort))
+
+    def step(self) -> None:
+        if self._target is None:
+            return
+        now = self._clock.now_ns()
+        reach = self._profile.speed * (now - self._stepped_ns) * 1e-9
+        self._stepped_ns = now
+        self._reference += max(-reach, min(reach, self._target - self._reference))
+        finger = self._profile.fingers[0]
+        position = finger.closed + (finger.open - finger.closed) * self._reference / self._profile.width
+        gains = self._profile.gains
+        self._plant.drive(self._axis, gains.kp, gains.kd, position, 0.0, 0.0)
+
+
+def check_grip(profile: GripperProfile, width: float, force: float) -> None:
+    """Refuse what the gripper cannot do.
+
+    Raises:
+        ValueError: if a value is not finite or out of the profile's range.
+    """
+    if not 0.0 <= width <= profile.width:
+        raise ValueError(f"gripper width {width} m is outside 0..{profile.width}")
+    if not 0.0 < force <= profile.force:
+        raise ValueError(f"grip force {force} N is outside 0..{profile.force}")

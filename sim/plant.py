@@ -1,0 +1,173 @@
+"""The MuJoCo plant: an arm whose joints follow the drive law of MIT mode, as real drives do.
+
+Every joint is moved by `torque = kp (p - q) + kd (v - dq) + t`, clipped to its largest torque. MuJoCo evaluates the
+law inside its own step, so a drive's feedback loop runs at the physics rate whatever the rate of the commands.
+The sim backend and the emulated motors stand in front of the same plant; they differ in how a command reaches it.
+"""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from robotctl.hal.profile import GripperProfile, RobotProfile
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Truth, Vector
+
+PHYSICS_STEP_NS = 1_000_000
+_BRAKE_TORQUE = 500.0
+"""Nm of dry friction that a closed brake adds."""
+
+
+class AxisState(NamedTuple):
+    """True state of one drive axis, in joint coordinates."""
+
+    position: float
+    velocity: float
+    effort: float
+
+
+class Plant:
+    """A robot in MuJoCo. Axes 0..n-1 are the arm's joints; axis n, where there is a gripper, its first finger.
+
+    Time moves by `advance`; between two calls the latest drive commands act. Nothing here reads a clock.
+    """
+
+    def __init__(self, robot: Robot, start_ns: int = 0) -> None:
+        """Build the plant at rest in the profile's home pose, all drives off."""
+        profile = robot.profile
+        self.time_ns = start_ns
+        self.dof = robot.dof
+        self.model, actuators = _build(robot)
+        self.data = mujoco.MjData(self.model)
+        joints = [joint.name for joint in profile.joints]
+        self.axes = robot.dof + (1 if profile.gripper else 0)
+        if profile.gripper:
+            joints.append(profile.gripper.fingers[0].name)
+        ids = [self.model.joint(name).id for name in joints]
+        self._qpos = np.array([self.model.jnt_qposadr[i] for i in ids])
+        self._dofs = np.array([self.model.jnt_dofadr[i] for i in ids])
+        self._actuators = np.array(actuators)
+        self._tool_site = self.model.site("robotctl_tool").id
+        self._friction = self.model.dof_frictionloss.copy()
+        self._lagged = self.model.na > 0
+        self._brakes = profile.brakes
+        for axis in range(self.axes):
+            self.release(axis)
+        self.place(np.array(profile.home))
+
+    def place(self, position: Vector) -> None:
+        """Put the arm at rest at `position`, rad. For starts and tests; a real arm has no such thing."""
+        self.data.qpos[self._qpos[: self.dof]] = position
+        self.data.qvel[:] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+
+    def advance(self, to_ns: int) -> None:
+        """Step the physics up to the last whole step at or before `to_ns`."""
+        steps = (to_ns - self.time_ns) // PHYSICS_STEP_NS
+        if steps > 0:
+            mujoco.mj_step(self.model, self.data, steps)
+            self.time_ns += steps * PHYSICS_STEP_NS
+
+    def drive(self, axis: int, kp: float, kd: float, position: float, velocity: float, effort: float) -> None:
+        """Set the law that an enabled drive follows from now on (joint coordinates, SI)."""
+        actuator = self._actuators[axis]
+        bias = self.model.actuator_biasprm[actuator]
+        bias[1] = -kp
+        bias[2] = -kd
+        self.model.dof_frictionloss[self._dofs[axis]] = self._friction[self._dofs[axis]]
+        self.data.ctrl[actuator] = kp * position + kd * velocity + effort
+
+    def drive_arm(self, kp: Vector, kd: Vector, position: Vector, velocity: Vector, effort: Vector) -> None:
+        """Set the law of all arm joints at once; arrays are (n,)."""
+        n = self.dof
+        bias = self.model.actuator_biasprm
+        bias[:n, 1] = -kp
+        bias[:n, 2] = -kd
+        self.data.ctrl[:n] = kp * position + kd * velocity + effort
+
+    def settle_lag(self, axis: int) -> None:
+        """Let the lag of an axis start from its present command, as a drive does that was just enabled."""
+        if self._lagged and axis < self.dof:
+            self.data.act[axis] = self.data.ctrl[axis]
+
+    def release(self, axis: int) -> None:
+        """Switch the drive of an axis off: no torque; the brake, where there is one, closes."""
+        self.drive(axis, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.settle_lag(axis)
+        if self._brakes and axis < self.dof:
+            self.model.dof_frictionloss[self._dofs[axis]] = _BRAKE_TORQUE
+
+    def axis(self, axis: int) -> AxisState:
+        """Return the true state of one axis."""
+        return AxisState(
+            float(self.data.qpos[self._qpos[axis]]),
+            float(self.data.qvel[self._dofs[axis]]),
+            float(self.data.actuator_force[self._actuators[axis]]),
+        )
+
+    def truth(self) -> Truth:
+        """Return the arm's true state, as copies."""
+        n = self.dof
+        return Truth(
+            self.data.qpos[self._qpos[:n]],
+            self.data.qvel[self._dofs[:n]],
+            self.data.actuator_force[:n].copy(),
+            self.data.site_xpos[self._tool_site].copy(),
+        )
+
+    def push(self, effort: Vector) -> None:
+        """Apply external torques (n,) to the joints, Nm, until the next call: a person, a wall, a collision."""
+        self.data.qfrc_applied[self._dofs[: self.dof]] = effort
+
+
+def _build(robot: Robot) -> tuple[mujoco.MjModel, list[int]]:
+    profile = robot.profile
+    spec = mujoco.MjSpec.from_string(robot.description.xml)
+    spec.option.timestep = PHYSICS_STEP_NS * 1e-9
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    _mark_tool(spec, profile)
+    for joint in profile.joints:
+        _add_drive(spec, joint.name, joint.torque, profile.twin.lag_s)
+    if profile.gripper:
+        _couple_fingers(spec, profile.gripper)
+        _add_drive(spec, profile.gripper.fingers[0].name, profile.gripper.force, 0.0)
+    model = spec.compile()
+    return model, list(range(model.nu))
+
+
+def _add_drive(spec: mujoco.MjSpec, joint: str, torque: float, lag_s: float) -> None:
+    actuator = spec.add_actuator(name=f"drive_{joint}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
+    actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+    actuator.gainprm[0] = 1.0
+    actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    actuator.forcerange = [-torque, torque]
+    actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    if lag_s > 0.0:
+        actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+        actuator.dynprm[0] = lag_s
+
+
+def _mark_tool(spec: mujoco.MjSpec, profile: RobotProfile) -> None:
+    body = spec.body(profile.tool_frame)
+    position = np.array(profile.tool_offset)
+    if body is None:
+        site = spec.site(profile.tool_frame)
+        body, position = site.parent, site.pos + position
+    payload = profile.twin.payload
+    body.add_site(name="robotctl_tool", pos=position)
+    if payload > 0.0:
+        load = body.add_body(name="robotctl_payload", pos=position)
+        load.mass = payload
+        load.inertia = [payload * 1e-3] * 3
+        load.explicitinertial = True
+
+
+def _couple_fingers(spec: mujoco.MjSpec, gripper: GripperProfile) -> None:
+    first = gripper.fingers[0]
+    for other in gripper.fingers[1:]:
+        ratio = (other.open - other.closed) / (first.open - first.closed)
+        coupling = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+        coupling.name1, coupling.name2 = other.name, first.name
+        coupling.data[:5] = [other.closed - ratio * first.closed, ratio, 0.0, 0.0, 0.0]
