@@ -44,6 +44,11 @@ class Kinematics:
         self._tool = self.model.addFrame(tool)
         self._data = self.model.createData()
         self._aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        self.reach = float(
+            sum(np.linalg.norm(joint.translation) for joint in list(self.model.jointPlacements)[2:])
+            + np.linalg.norm(placement.translation)
+        )
+        """Length of the chain from the first joint to the tool point, m: no joint is further from it."""
         self.damping = np.array(self.model.damping)
         """Viscous friction of each joint, Nms/rad."""
         self.friction = np.array(self.model.friction)

@@ -155,7 +155,7 @@ class Safety(_Strict):
     """Age of a joint's feedback above which the arm is stopped for good."""
     drive_timeout_s: Positive = 0.1
     """Longest watchdog timeout a drive may report; without one it is refused."""
-    standstill: Positive = 0.02
+    standstill: Positive = 0.05
     """Measured joint speed below which a joint counts as at rest, rad/s."""
     reset_scale: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
     """Fraction of the velocity caps that reset routines may use."""

@@ -39,7 +39,6 @@ class SimArm(Arm):
         self._delay_ns = round(self._twin.delay_s * 1e9)
         self._noisy = self._twin.noise_position > 0.0 or self._twin.noise_velocity > 0.0
         self._waiting: deque[tuple[int, Command]] = deque()
-        self._stamps = np.zeros(robot.dof, dtype=np.int64)
         self._connected = False
         self._enabled = False
 
@@ -67,9 +66,7 @@ class SimArm(Arm):
         if self._noisy:
             position = position + self._rng.normal(0.0, self._twin.noise_position, position.shape)
             velocity = velocity + self._rng.normal(0.0, self._twin.noise_velocity, velocity.shape)
-        stamps = self._stamps
-        stamps[:] = now
-        return Sample(now, position, velocity, truth.effort, stamps, (), self._enabled)
+        return Sample(now, position, velocity, truth.effort, np.full(self._plant.dof, now), (), self._enabled)
 
     def write(self, command: Command) -> Sent:
         if not self._enabled:

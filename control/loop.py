@@ -1,0 +1,349 @@
+"""The loop: one `tick()` is everything that happens in a servo period, for twin and hardware alike.
+
+    sample -> supervise -> admit -> limit -> shape -> write -> publish
+
+It runs in real time in a process of its own (`control.process`) or in lockstep on a virtual clock
+(`control.session`), unchanged.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+
+from robotctl.control.kinematics import Kinematics
+from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
+from robotctl.control.reference import Reference
+from robotctl.control.shared import Link
+from robotctl.hal.backend import Rig
+from robotctl.hal.clock import Clock
+from robotctl.hal.errors import RobotctlError
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Command, CommandMode, Sample, Vector
+from robotctl.safety.machine import ENABLED, Event, Refused, State
+from robotctl.safety.routines import Goto, Retreat, Routine, Settle
+from robotctl.safety.shaper import Clip, Shaper
+from robotctl.safety.supervisor import Supervisor
+from robotctl.safety.target import FreeDrive, JointTorque, JointVelocity, Target
+from robotctl.safety.torque import StoppableMotion
+from robotctl.safety.trip import Category, Protection, Trip
+
+_LOWERING_S = 2.0
+"""Time over which gravity compensation fades before the drives of an arm without brakes go off."""
+
+
+class Verb(IntEnum):
+    """What an operator may ask of a running loop."""
+
+    ARM = 1
+    START = 2
+    HOME = 3
+    PARK = 4
+    RETREAT = 5
+    SETTLE = 6
+    STOP = 7
+    DISARM = 8
+    ACK = 9
+    ESTOP = 10
+    CLOSE = 11
+
+
+class Loop:
+    """The control of one arm. `link` is where targets and requests come from and ticks and events go to."""
+
+    def __init__(self, robot: Robot, rig: Rig, clock: Clock, link: Link) -> None:
+        self.robot = robot
+        self.supervisor = Supervisor(robot)
+        self.kinematics = Kinematics(robot)
+        self.closed = False
+        self.lateness_ns = 0
+        """How late the present tick began; set by whoever paces the loop."""
+        self._arm = rig.arm
+        self._gripper = rig.gripper
+        self._clock = clock
+        self._link = link
+        self._limiter = VelocityLimiter(robot)
+        self._torque_limiter = TorqueLimiter(robot)
+        self._shaper = Shaper(robot, self.kinematics)
+        self._stoppable = StoppableMotion(robot, self.kinematics)
+        self._reference = Reference(robot, self.kinematics)
+        self._routine: Routine | None = None
+        self._routine_ends_ns = 0
+        self._zero = np.zeros(robot.dof)
+        self._torque: Vector | None = None
+        self._clip = Clip.NONE
+        self._wanted: Vector = self._zero
+        self._command = Command(CommandMode.TRACK, self._zero, self._zero, self._zero)
+        self._estop: str = ""
+        self._damping = False
+        self._lowering_ns: int | None = None
+        self._ticks = 0
+        self._reported = 0
+        self._state = State.OFF
+
+    # -- life -----------------------------------------------------------------------------------------------------
+
+    def bring_up(self) -> None:
+        """Connect and self-test: from OFF to READY.
+
+        Raises:
+            HardwareError: if the bus or a drive is not as it should be.
+        """
+        self._arm.connect()
+        self.supervisor.handle(Event.CONNECT)
+        self._selftest()
+
+    def shut_down(self) -> None:
+        """Take the torque away if it is still there, and release the arm. Harmless when already done."""
+        if not self.closed:
+            self.closed = True
+            try:
+                self._arm.disable()
+            finally:
+                self._arm.close()
+
+    def estop(self, source: str) -> None:
+        """Ask for an emergency stop in the next tick. May be called from a signal handler."""
+        self._estop = source
+
+    # -- the tick -------------------------------------------------------------------------------------------------
+
+    def tick(self) -> None:
+        """Do everything that is due in one servo period."""
+        now = self._clock.now_ns()
+        supervisor = self.supervisor
+        sample = self._arm.read()
+        tool = self.kinematics.tool(sample.position)
+        if self._estop:
+            self._serve_estop(now)
+        request = self._link.desk.pending()
+        if request is not None:
+            self._serve(*request, sample, now)
+        supervisor.observe(sample, tool, self._reference.position, now)
+        target = self._link.mailbox.take()
+        if target is not None:
+            supervisor.offer(target, now)
+        if supervisor.state in ENABLED:
+            self._drive(sample, now)
+        elif supervisor.state is State.DISABLED or self._damping:
+            self._cut(sample, now)
+        if self._gripper is not None:
+            self._gripper.step()
+        if supervisor.state is not self._state or self._reported != len(supervisor.reactions):
+            self._report(now)
+        self._publish(sample, tool, now)
+
+    def _drive(self, sample: Sample, now: int) -> None:
+        """Send the command of a state with enabled drives."""
+        state = self.supervisor.state
+        target: Target | None = None
+        wanted = self._zero
+        if state is State.RUN:
+            target = self.supervisor.admitted(now)
+        elif state is State.RESET:
+            wanted = self._routine_velocity(sample, now)
+        match target:
+            case JointVelocity(values=values):
+                wanted = values
+            case JointTorque(values=values):
+                if self._apply_torque(values, sample, now):
+                    return
+            case FreeDrive():
+                if self._apply_torque(self._zero, sample, now):
+                    return
+        if self._torque is not None:
+            self._reference.resync(sample.position, sample.velocity)
+            self._torque = None
+        self._track(wanted, sample)
+
+    def _track(self, wanted: Vector, sample: Sample) -> None:
+        reference = self._reference
+        category = self.supervisor.category
+        if category is Category.BRAKE_OFF:
+            limited = self._shaper.brake(reference.velocity)
+        else:
+            limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
+        tool, jacobian = self.kinematics.tool_and_jacobian(reference.position)
+        velocity, clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
+        self._wanted, self._clip = wanted, clip
+        self._command = reference.step(velocity, sample.position)
+        self._arm.write(self._command)
+
+    def _apply_torque(self, torque: Vector, sample: Sample, now: int) -> bool:
+        """Send a torque command if the present motion can still be stopped inside all limits; else trip."""
+        trip = self._stoppable.check(sample)
+        if trip is not None:
+            self.supervisor.trip(trip, now)
+            return False
+        gravity = self.kinematics.gravity(sample.position)
+        previous = self._command.effort if self._torque is None else self._torque
+        self._torque = self._torque_limiter.step(gravity + torque, previous)
+        self._wanted, self._clip = torque, Clip.NONE
+        self._reference.resync(sample.position, sample.velocity)
+        self._command = Command(CommandMode.EFFORT, sample.position, self._zero, self._torque)
+        self._arm.write(self._command)
+        return True
+
+    def _cut(self, sample: Sample, now: int) -> None:
+        """The profile's category 0 action: drives off, or damped with gravity compensated until told otherwise."""
+        clean = self.supervisor.cause is None
+        if self.supervisor.state is State.DISABLED:
+            self._damping = self.robot.profile.category0 == "damp"
+            if clean:
+                self._lowering_ns = now
+            if self._damping and not clean:
+                self.supervisor.handle(Event.OFF_FAULT)
+        if self._damping and sample.enabled and not self.supervisor.feedback.stale:
+            fade = 1.0
+            if self._lowering_ns is not None:
+                fade = 1.0 - (now - self._lowering_ns) / (_LOWERING_S * 1e9)
+            if fade > 0.0:
+                gravity = fade * self.kinematics.gravity(sample.position)
+                self._command = Command(CommandMode.DAMP, sample.position, self._zero, gravity)
+                self._arm.write(self._command)
+                return
+        self._damping = False
+        self._arm.disable()
+        if self.supervisor.state is State.DISABLED:
+            self.supervisor.handle(Event.OFF_CLEAN if clean else Event.OFF_FAULT)
+
+    def _routine_velocity(self, sample: Sample, now: int) -> Vector:
+        routine = self._routine
+        if routine is None:
+            return self._zero
+        velocity = routine.velocity(sample, self._reference.position)
+        if velocity is None:
+            self._routine = None
+            self.supervisor.handle(Event.RESET_DONE)
+            return self._zero
+        if now > self._routine_ends_ns:
+            cause = f"reset routine {routine.name!r} did not arrive within {routine.timeout_s:g} s"
+            self.supervisor.trip(Trip(Protection.RESET, Category.BRAKE_HOLD, cause, self._routine_ends_ns), now)
+            return self._zero
+        return velocity
+
+    # -- the operator ---------------------------------------------------------------------------------------------
+
+    def _serve(self, number: int, verb: int, sample: Sample, now: int) -> None:
+        """Carry out one request and answer it. A refused request changes nothing."""
+        text = ""
+        try:
+            self._carry_out(Verb(verb), sample, now)
+        except (Refused, RobotctlError) as error:
+            text = str(error)
+        self._link.events.write({"type": "answer", "stamp_ns": now, "number": number, "ok": not text, "text": text})
+        self._link.desk.answer(number)
+
+    def _carry_out(self, verb: Verb, sample: Sample, now: int) -> None:
+        supervisor = self.supervisor
+        match verb:
+            case Verb.ARM:
+                supervisor.handle(Event.ARM)
+                self._enable(sample)
+            case Verb.START:
+                supervisor.handle(Event.START)
+                supervisor.admission.renew(now)
+            case Verb.HOME:
+                self._reset(Goto(self.robot, np.array(self.robot.profile.home), "home", self.kinematics), now)
+            case Verb.PARK:
+                self._reset(Goto(self.robot, np.array(self.robot.profile.rest), "park", self.kinematics), now)
+            case Verb.RETREAT:
+                self._reset(Retreat(self.robot, self.kinematics), now)
+            case Verb.SETTLE:
+                self._reset(Settle(self.robot), now)
+            case Verb.STOP:
+                supervisor.handle(Event.STOP)
+            case Verb.DISARM:
+                supervisor.handle(Event.DISARM)
+            case Verb.ACK:
+                if supervisor.handle(Event.ACK) is State.SILENT:
+                    self._arm.disable()
+                    self._damping = False
+                    self._selftest()
+                else:
+                    self._reference.resync(self._reference.position, self._reference.velocity)
+            case Verb.ESTOP:
+                self.estop("the operator")
+            case Verb.CLOSE:
+                self._close(now)
+
+    def _reset(self, routine: Routine, now: int) -> None:
+        if self.supervisor.recovery and not isinstance(routine, Retreat):
+            raise Refused(self.supervisor.state, Event.RESET)
+        self.supervisor.handle(Event.RESET)
+        self._routine = routine
+        self._routine_ends_ns = now + round(routine.timeout_s * 1e9)
+
+    def _selftest(self) -> None:
+        self._arm.verify()
+        self.supervisor.handle(Event.SELFTEST)
+
+    def _enable(self, sample: Sample) -> None:
+        try:
+            self._reference.resync(sample.position, self._zero)
+            self._arm.enable()
+        except RobotctlError as error:
+            trip = Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), sample.stamp_ns)
+            self.supervisor.trip(trip, sample.stamp_ns)
+            raise
+
+    def _close(self, now: int) -> None:
+        if self._damping and self._lowering_ns is None:
+            self._lowering_ns = now
+        if not self._damping:
+            self.supervisor.handle(Event.CLOSE)
+            self.shut_down()
+
+    def _serve_estop(self, now: int) -> None:
+        cause = f"emergency stop by {self._estop}; release it, then acknowledge"
+        self._estop = ""
+        self.supervisor.trip(Trip(Protection.ESTOP, Category.BRAKE_OFF, cause, now), now)
+
+    # -- publishing -----------------------------------------------------------------------------------------------
+
+    def _report(self, now: int) -> None:
+        supervisor = self.supervisor
+        events = self._link.events
+        for reaction in supervisor.reactions[self._reported :]:
+            trip = reaction.trip
+            events.write(
+                {
+                    "type": "trip",
+                    "stamp_ns": now,
+                    "protection": trip.protection.label,
+                    "stop_category": int(trip.category),
+                    "reaction_ms": round(reaction.reaction_ms, 3),
+                    "text": trip.cause,
+                }
+            )
+        self._reported = len(supervisor.reactions)
+        if supervisor.state is not self._state:
+            text = f"{self._state.name} -> {supervisor.state.name}"
+            events.write({"type": "state", "stamp_ns": now, "state": supervisor.state.name, "text": text})
+            self._state = supervisor.state
+
+    def _publish(self, sample: Sample, tool: Vector, now: int) -> None:
+        ring = self._link.ticks
+        record = ring.records[self._ticks % ring.slots]
+        record["tick"] = self._ticks
+        record["stamp_ns"] = now
+        record["lateness_ns"] = self.lateness_ns
+        record["epoch"] = self.supervisor.epoch
+        record["state"] = self.supervisor.state
+        record["clip"] = self._clip
+        record["position"] = sample.position
+        record["velocity"] = sample.velocity
+        record["effort"] = sample.effort
+        record["wanted"] = self._wanted
+        record["command_position"] = self._command.position
+        record["command_velocity"] = self._command.velocity
+        record["command_effort"] = self._command.effort
+        record["tool"] = tool
+        truth = self._arm.truth()
+        record["has_truth"] = truth is not None
+        if truth is not None:
+            record["true_position"] = truth.position
+            record["true_velocity"] = truth.velocity
+            record["true_tool"] = truth.tool
+        self._ticks += 1
+        record["duration_ns"] = self._clock.now_ns() - now
+        ring.publish(self._ticks)

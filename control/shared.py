@@ -1,0 +1,274 @@
+"""Shared memory between the control process and its neighbours: nothing in it can block, back up or be left behind.
+
+The memory is anonymous (memfd) and handed down as a file descriptor, so it has no name and vanishes with its last
+user, however that one dies. The policy gets two descriptors: its mailbox, and a read-only view of the rest.
+
+Latest values are guarded by a version that is odd while a write is in progress; rings by a head that moves after
+the slot is complete. Single writer each; x86 and ARM64 both keep aligned 8-byte stores whole.
+"""
+
+import json
+import mmap
+import os
+import struct
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robotctl.hal.types import Vector
+from robotctl.safety.target import FreeDrive, Hold, JointTorque, JointVelocity, Target
+
+MAX_VALUES = 16
+"""Most values a target may carry through a mailbox."""
+
+Buffer = mmap.mmap | bytearray
+_HEAD = struct.Struct("<Q")
+_TARGET = struct.Struct(f"<Qqqqii{MAX_VALUES}d")
+"""version, epoch, seq, deadline, kind, count, values"""
+_KINDS: dict[int, type[Target]] = {1: JointVelocity, 2: JointTorque, 3: Hold, 4: FreeDrive}
+_NUMBERS = {kind: number for number, kind in _KINDS.items()}
+
+
+class Mailbox:
+    """The latest target of one policy. The policy puts, the control process takes; neither ever waits."""
+
+    SIZE = _TARGET.size
+
+    def __init__(self, buffer: Buffer) -> None:
+        self._buffer = buffer
+        self._version = 0
+        self._seen = 0
+
+    def put(self, target: Target) -> None:
+        """Publish a target, replacing the last one.
+
+        Raises:
+            ValueError: if it carries more values than fit.
+        """
+        values = getattr(target, "values", None)
+        flat = [] if values is None else np.asarray(values, dtype=np.float64).ravel().tolist()
+        if len(flat) > MAX_VALUES:
+            raise ValueError(f"a target has at most {MAX_VALUES} values, got {len(flat)}")
+        padded = flat + [0.0] * (MAX_VALUES - len(flat))
+        self._version += 2
+        _HEAD.pack_into(self._buffer, 0, self._version - 1)
+        body = (target.epoch, target.seq, target.deadline_ns, _NUMBERS[type(target)], len(flat), *padded)
+        _TARGET.pack_into(self._buffer, 0, self._version - 1, *body)
+        _HEAD.pack_into(self._buffer, 0, self._version)
+
+    def take(self) -> Target | None:
+        """Return the target if it is new and whole, else None."""
+        version = _HEAD.unpack_from(self._buffer, 0)[0]
+        if version == self._seen or version & 1:
+            return None
+        _, epoch, seq, deadline, number, count, *values = _TARGET.unpack_from(self._buffer, 0)
+        if _HEAD.unpack_from(self._buffer, 0)[0] != version:
+            return None
+        self._seen = version
+        kind = _KINDS.get(number)
+        if kind is JointVelocity or kind is JointTorque:
+            return kind(np.array(values[: max(0, min(count, MAX_VALUES))]), epoch, seq, deadline)
+        if kind is Hold or kind is FreeDrive:
+            return kind(epoch, seq, deadline)
+        # Not something a mailbox of ours wrote: let admission complain about its shape.
+        return JointVelocity(np.empty(0), epoch, seq, deadline)
+
+
+class Desk:
+    """Requests of the operator to the control process, one at a time, each with its answer.
+
+    `ask` is used by the operator's side, `pending` and `answer` by the control process.
+    """
+
+    _FORM = struct.Struct("<QQi")
+    """asked, answered, verb; the answer's text goes through the event ring"""
+    SIZE = _FORM.size
+
+    def __init__(self, buffer: Buffer, offset: int = 0) -> None:
+        self._buffer = buffer
+        self._offset = offset
+
+    def ask(self, verb: int) -> int:
+        """Post a request and return its number."""
+        number = int(_HEAD.unpack_from(self._buffer, self._offset)[0]) + 1
+        struct.pack_into("<i", self._buffer, self._offset + 16, verb)
+        _HEAD.pack_into(self._buffer, self._offset, number)
+        return number
+
+    def answered(self, number: int) -> bool:
+        return int(self._FORM.unpack_from(self._buffer, self._offset)[1]) >= number
+
+    def pending(self) -> tuple[int, int] | None:
+        """Return (number, verb) of a request that waits, else None."""
+        asked, answered, verb = self._FORM.unpack_from(self._buffer, self._offset)
+        return (asked, verb) if asked != answered else None
+
+    def answer(self, number: int) -> None:
+        _HEAD.pack_into(self._buffer, self._offset + 8, number)
+
+
+def tick_dtype(dof: int) -> np.dtype[Any]:
+    """Return the record that every tick leaves behind."""
+    joints = (np.float64, (dof,))
+    return np.dtype(
+        [
+            ("tick", np.int64),
+            ("stamp_ns", np.int64),
+            ("lateness_ns", np.int64),
+            ("duration_ns", np.int64),
+            ("epoch", np.int64),
+            ("seq", np.int64),
+            ("state", np.int32),
+            ("clip", np.int32),
+            ("position", *joints),
+            ("velocity", *joints),
+            ("effort", *joints),
+            ("wanted", *joints),
+            ("command_position", *joints),
+            ("command_velocity", *joints),
+            ("command_effort", *joints),
+            ("tool", np.float64, (3,)),
+            ("has_truth", np.int64),
+            ("true_position", *joints),
+            ("true_velocity", *joints),
+            ("true_tool", np.float64, (3,)),
+            ("gripper_width", np.float64),
+        ]
+    )
+
+
+class TickRing:
+    """The last ticks, one record each: latest state for the policy, history for recorder and black box."""
+
+    def __init__(self, buffer: Buffer, offset: int, dof: int, slots: int) -> None:
+        self._buffer = buffer
+        self._offset = offset
+        self.slots = slots
+        self.dtype = tick_dtype(dof)
+        self.records: NDArray[Any] = np.frombuffer(buffer, self.dtype, slots, offset + 64)
+
+    @staticmethod
+    def size(dof: int, slots: int) -> int:
+        return 64 + tick_dtype(dof).itemsize * slots
+
+    @property
+    def head(self) -> int:
+        """Number of records written so far."""
+        return int(_HEAD.unpack_from(self._buffer, self._offset)[0])
+
+    def publish(self, head: int) -> None:
+        """Make record `head - 1` visible."""
+        _HEAD.pack_into(self._buffer, self._offset, head)
+
+    def latest(self) -> np.void | None:
+        """Return a copy of the newest record, or None before the first."""
+        head = self.head
+        return self.records[(head - 1) % self.slots].copy() if head else None
+
+    def since(self, cursor: int) -> tuple[NDArray[Any], int, int]:
+        """Return the records from number `cursor` on, the new cursor, and how many were overwritten unread."""
+        head = self.head
+        # The writer may be in the slot that is oldest; leave a little room.
+        first = max(cursor, head - self.slots + 64)
+        dropped = max(0, first - cursor)
+        if head <= first:
+            return self.records[:0].copy(), max(cursor, head), dropped
+        begin, end = first % self.slots, head % self.slots
+        if begin < end:
+            part = self.records[begin:end].copy()
+        else:
+            part = np.concatenate([self.records[begin:], self.records[:end]])
+        return part, head, dropped
+
+
+class EventRing:
+    """The last events (state changes, trips, answers, log lines) as JSON texts."""
+
+    SLOT = 1024
+    SLOTS = 256
+    SIZE = 8 + SLOT * SLOTS
+
+    def __init__(self, buffer: Buffer, offset: int) -> None:
+        self._buffer = buffer
+        self._offset = offset
+
+    def write(self, event: dict[str, object]) -> None:
+        """Append one event; a text too long for a slot loses its end of `text`."""
+        data = json.dumps(event).encode()
+        if len(data) > self.SLOT - 4:
+            excess = len(data) - (self.SLOT - 4)
+            text = str(event.get("text", ""))
+            data = json.dumps({**event, "text": text[: max(0, len(text) - 2 * excess)]}).encode()[: self.SLOT - 4]
+        head = _HEAD.unpack_from(self._buffer, self._offset)[0]
+        at = self._offset + 8 + head % self.SLOTS * self.SLOT
+        struct.pack_into("<I", self._buffer, at, len(data))
+        self._buffer[at + 4 : at + 4 + len(data)] = data
+        _HEAD.pack_into(self._buffer, self._offset, head + 1)
+
+    def since(self, cursor: int) -> tuple[list[dict[str, Any]], int]:
+        """Return the events from number `cursor` on, and the new cursor."""
+        head = int(_HEAD.unpack_from(self._buffer, self._offset)[0])
+        events = []
+        for number in range(max(cursor, head - self.SLOTS + 1), head):
+            at = self._offset + 8 + number % self.SLOTS * self.SLOT
+            (length,) = struct.unpack_from("<I", self._buffer, at)
+            events.append(json.loads(bytes(self._buffer[at + 4 : at + 4 + length])))
+        return events, head
+
+
+@dataclass(slots=True)
+class Link:
+    """Everything a control process shares. `fds` are the mailbox's and the board's, or None within one process."""
+
+    mailbox: Mailbox
+    desk: Desk
+    events: EventRing
+    ticks: TickRing
+    fds: tuple[int, int] | None = None
+
+    @classmethod
+    def create(cls, dof: int, slots: int) -> Self:
+        """Create fresh shared memory for an arm with `dof` joints, remembering `slots` ticks."""
+        fds = []
+        for name, size in (("mailbox", Mailbox.SIZE), ("board", cls._board_size(dof, slots))):
+            fd = os.memfd_create(f"robotctl-{name}")
+            os.ftruncate(fd, size)
+            fds.append(fd)
+        return cls.attach(fds[0], fds[1], dof, slots)
+
+    @classmethod
+    def attach(cls, mailbox_fd: int, board_fd: int, dof: int, slots: int, *, read_only: bool = False) -> Self:
+        """Map the memory behind two descriptors; with `read_only` the board cannot be written to."""
+        mailbox = mmap.mmap(mailbox_fd, Mailbox.SIZE)
+        access = mmap.ACCESS_READ if read_only else mmap.ACCESS_WRITE
+        board = mmap.mmap(board_fd, cls._board_size(dof, slots), access=access)
+        return cls._lay_out(mailbox, board, dof, slots, (mailbox_fd, board_fd))
+
+    @classmethod
+    def local(cls, dof: int, slots: int) -> Self:
+        """Return the same within one process: lockstep and tests."""
+        return cls._lay_out(bytearray(Mailbox.SIZE), bytearray(cls._board_size(dof, slots)), dof, slots, None)
+
+    @classmethod
+    def _lay_out(
+        cls, mailbox: Buffer, board: Buffer, dof: int, slots: int, fds: tuple[int, int] | None
+    ) -> Self:
+        return cls(
+            Mailbox(mailbox),
+            Desk(board, 0),
+            EventRing(board, 64),
+            TickRing(board, 64 + EventRing.SIZE, dof, slots),
+            fds,
+        )
+
+    @staticmethod
+    def _board_size(dof: int, slots: int) -> int:
+        return 64 + EventRing.SIZE + TickRing.size(dof, slots)
+
+
+def vector(record: np.void, field: str) -> Vector:
+    """Return an array field of a record."""
+    array: Vector = record[field]
+    return array

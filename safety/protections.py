@@ -1,0 +1,109 @@
+"""Protections that judge what was measured. Each is one small function or class, named after what it protects.
+
+All of them are asked in every tick by the supervisor and answer with a `Trip` or None. Those that shape commands
+instead (velocity, acceleration, position and sphere) live in `shaper.py`; those that judge targets in `admission.py`.
+"""
+
+import numpy as np
+
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Sample, Vector
+from robotctl.safety.trip import Category, Protection, Trip
+
+
+class PositionBreach:
+    """P3: a measured joint is past its soft limit by more than the profile's `position_breach`."""
+
+    def __init__(self, robot: Robot) -> None:
+        breach = robot.profile.safety.position_breach
+        self._names = [joint.name for joint in robot.profile.joints]
+        self._middle = 0.5 * (robot.limits.upper + robot.limits.lower)
+        self._half = 0.5 * (robot.limits.upper - robot.limits.lower) + breach
+
+    def check(self, sample: Sample) -> Trip | None:
+        beyond = np.abs(sample.position - self._middle) - self._half
+        joint = int(beyond.argmax())
+        if not beyond[joint] > 0.0:
+            return None
+        cause = (
+            f"{self._names[joint]} measured at {sample.position[joint]:.3f} rad, outside its limits; acknowledge, then retreat"
+        )
+        return Trip(Protection.POSITION, Category.BRAKE_OFF, cause, sample.stamp_ns)
+
+
+class SphereBreach:
+    """P5: the measured tool point is outside the sphere by more than the profile's `sphere_breach`."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._centre = np.array(robot.profile.sphere.centre)
+        self._radius = robot.profile.sphere.radius
+        self._breach = robot.profile.safety.sphere_breach
+
+    def outside(self, tool: Vector) -> float:
+        """Return how far `tool` is outside the sphere, m; negative inside."""
+        offset = tool - self._centre
+        return float(offset @ offset) ** 0.5 - self._radius
+
+    def check(self, tool: Vector, stamp_ns: int) -> Trip | None:
+        outside = self.outside(tool)
+        if not outside > self._breach:
+            return None
+        cause = f"tool measured {1e3 * outside:.0f} mm outside its sphere; acknowledge, then retreat"
+        return Trip(Protection.SPHERE, Category.BRAKE_HOLD, cause, stamp_ns)
+
+
+class FeedbackAge:
+    """P12: a joint was not heard of. Young enough: nothing; older: `stale`; too old: a trip."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._names = [joint.name for joint in robot.profile.joints]
+        self._stop_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
+        self._fault_ns = round(robot.profile.safety.feedback_fault_s * 1e9)
+        self.stale = False
+        """Whether the reference is to be braked to rest."""
+
+    def check(self, sample: Sample, now_ns: int) -> Trip | None:
+        age = now_ns - int(sample.joint_stamp_ns.min())
+        self.stale = age > self._stop_ns
+        if age <= self._fault_ns:
+            return None
+        joint = int(sample.joint_stamp_ns.argmin())
+        heard = int(sample.joint_stamp_ns[joint])
+        cause = (
+            f"{self._names[joint]} has not answered for {age / 1e6:.0f} ms; "
+            "check its power, its connector and the bus, then acknowledge"
+        )
+        return Trip(Protection.FEEDBACK, Category.BRAKE_OFF, cause, heard + self._fault_ns)
+
+
+class TrackingError:
+    """P17: the arm does not follow its reference: a stuck joint, a collision, a wrong sign, an unknown load."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._names = [joint.name for joint in robot.profile.joints]
+        self._largest = robot.profile.safety.tracking_error
+
+    def check(self, sample: Sample, reference: Vector) -> Trip | None:
+        error = np.abs(reference - sample.position)
+        joint = int(error.argmax())
+        if not error[joint] > self._largest:
+            return None
+        cause = (
+            f"{self._names[joint]} is {error[joint]:.3f} rad away from where it was led; "
+            "look for a collision, a stuck joint or an unknown load, then acknowledge"
+        )
+        return Trip(Protection.TRACKING, Category.BRAKE_OFF, cause, sample.stamp_ns)
+
+
+class DriveHealth:
+    """P24: a drive reports a fault, or lost its torque while the arm should hold."""
+
+    def check(self, sample: Sample, *, expect_enabled: bool) -> Trip | None:
+        if sample.faults:
+            fault = sample.faults[0]
+            cause = f"{fault.joint}: drive reports {fault.name} (code 0x{fault.code:X}); {fault.hint}"
+            return Trip(Protection.DRIVE, Category.BRAKE_OFF, cause, sample.stamp_ns)
+        if expect_enabled and not sample.enabled:
+            cause = "a drive went off by itself; check its power and watchdog, then acknowledge"
+            return Trip(Protection.DRIVE, Category.BRAKE_OFF, cause, sample.stamp_ns)
+        return None

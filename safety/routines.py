@@ -1,0 +1,109 @@
+"""Reset routines: small motions the supervisor runs by itself, through the same limiter and shaper as a policy.
+
+| | routine   | what it does                                                            |
+|-|-----------|-------------------------------------------------------------------------|
+|R0| `Settle`  | waits for measured standstill                                           |
+|R1| `Retreat` | leads joints and tool back inside, at a tenth of the caps               |
+|R2| `Goto`    | leads the joints straight to a pose (home, rest)                        |
+"""
+
+from abc import ABC, abstractmethod
+from typing import Protocol
+
+import numpy as np
+
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Sample, Vector
+from robotctl.safety.sphere import BoundingSphere
+
+_GAIN = 3.0
+"""Approach speed per rad of distance left, 1/s."""
+_ARRIVED = 2e-3
+"""rad"""
+_RETREAT_SCALE = 0.1
+_RETREAT_DEPTH = 0.01
+"""How far inside a boundary a retreat ends, m and rad."""
+
+
+class Geometry(Protocol):
+    """What the routines have to know of the arm."""
+
+    def tool_and_jacobian(self, position: Vector) -> tuple[Vector, Vector]: ...
+
+
+class Routine(ABC):
+    """One reset motion. Asked in every tick; it never blocks."""
+
+    name: str
+    timeout_s: float
+
+    @abstractmethod
+    def velocity(self, sample: Sample, position: Vector) -> Vector | None:
+        """Return the wanted joint velocity (n,), rad/s, at reference `position`; None when done."""
+
+
+class Settle(Routine):
+    """R0: nothing moves until the measured joints are at rest."""
+
+    name = "settle"
+
+    def __init__(self, robot: Robot) -> None:
+        self.timeout_s = 2.0 + robot.stopping_time_s
+        self._standstill = robot.profile.safety.standstill
+        self._rest = np.zeros(robot.dof)
+
+    def velocity(self, sample: Sample, position: Vector) -> Vector | None:
+        return None if bool((np.abs(sample.velocity) < self._standstill).all()) else self._rest
+
+
+class Retreat(Routine):
+    """R1: back inside the joint limits and the sphere, slowly, straight along the gradient."""
+
+    name = "retreat"
+    timeout_s = 30.0
+
+    def __init__(self, robot: Robot, geometry: Geometry) -> None:
+        margin = robot.profile.safety.position_margin + _RETREAT_DEPTH
+        self._lower = robot.limits.lower + margin
+        self._upper = robot.limits.upper - margin
+        self._cap = _RETREAT_SCALE * robot.limits.velocity
+        self._geometry = geometry
+        self._sphere = BoundingSphere(robot.profile)
+
+    def velocity(self, sample: Sample, position: Vector) -> Vector | None:
+        inside = np.minimum(np.maximum(position, self._lower), self._upper)
+        wanted = _GAIN * (inside - position)
+        tool, jacobian = self._geometry.tool_and_jacobian(position)
+        offset = tool - self._sphere.centre
+        distance = float(np.linalg.norm(offset))
+        outside = distance - self._sphere.radius + _RETREAT_DEPTH
+        if outside > 0.0:
+            damped = jacobian @ jacobian.T + 1e-3 * np.eye(3)
+            wanted = wanted - jacobian.T @ np.linalg.solve(damped, _GAIN * outside * offset / distance)
+        if float(np.abs(inside - position).max()) < _ARRIVED and outside < 0.2 * _RETREAT_DEPTH:
+            return None
+        # At least a crawl, so that the end is reached.
+        fastest = float((np.abs(wanted) / self._cap).max())
+        return wanted / max(1.0, fastest) if fastest > 0.2 else wanted * (0.2 / max(fastest, 1e-9))
+
+
+class Goto(Routine):
+    """R2: a straight line in joint space, all joints arriving together."""
+
+    def __init__(self, robot: Robot, pose: Vector, name: str, geometry: Geometry) -> None:
+        safety = robot.profile.safety
+        self.name = name
+        self.timeout_s = 60.0
+        self._pose = pose
+        self._cap = safety.reset_scale * robot.limits.velocity
+        self._tool_speed = safety.reset_tool_speed
+        self._geometry = geometry
+
+    def velocity(self, sample: Sample, position: Vector) -> Vector | None:
+        error = self._pose - position
+        if float(np.abs(error).max()) < _ARRIVED:
+            return None
+        wanted = _GAIN * error
+        _, jacobian = self._geometry.tool_and_jacobian(position)
+        speed = float(np.linalg.norm(jacobian @ wanted)) / self._tool_speed
+        return wanted / max(1.0, speed, float((np.abs(wanted) / self._cap).max()))

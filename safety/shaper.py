@@ -1,0 +1,167 @@
+"""The shaper: turns any wanted joint velocity into one that keeps all limits, now and until the arm has stopped.
+
+It works on the reference, the motion the drives are led along, in steps of one servo period with constant
+acceleration: q' = q + dt (v + v')/2. Three things hold for the v' it returns:
+
+1. it lies in a box: velocity caps, acceleration caps, and per joint a bound from which braking at the acceleration
+   cap ends at the soft limit;
+2. it is the velocity in that box closest to the wanted one that keeps the sphere's row (one QP, or the named
+   alternative `projection`);
+3. braking every joint at its cap from the next reference keeps the tool inside the sphere. Where a candidate fails
+   that, the shaper brakes instead, which is the very motion that the previous step proved; so the claim carries
+   over from step to step, whatever is asked for.
+"""
+
+from enum import IntFlag
+from typing import NamedTuple, Protocol
+
+import daqp
+import numpy as np
+
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Vector
+from robotctl.safety.sphere import BoundingSphere, Row
+
+_SOFT = 8
+"""daqp's sense of a constraint that gives way, at a price, rather than make the problem infeasible."""
+_SOLVED = (1, 2)
+"""daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
+
+
+class ToolModel(Protocol):
+    """What the shaper has to know of the arm's geometry."""
+
+    @property
+    def reach(self) -> float:
+        """A bound on the distance between the tool point and any joint's axis, m."""
+        ...
+
+    def tool(self, position: Vector) -> Vector:
+        """Return the tool point (3,), m, at joint positions (n,)."""
+        ...
+
+
+class Clip(IntFlag):
+    """Why a velocity differs from the one that was wanted."""
+
+    NONE = 0
+    VELOCITY = 1
+    POSITION = 2
+    SPHERE = 4
+    PREDICTED_STOP = 8
+    TORQUE = 16
+
+
+class Shaped(NamedTuple):
+    """The shaper's answer."""
+
+    velocity: Vector
+    """(n,), rad/s"""
+    clip: Clip
+
+
+class Shaper:
+    """Shapes the velocities of one robot. Holds scratch memory only; every call stands for itself."""
+
+    def __init__(self, robot: Robot, model: ToolModel) -> None:
+        safety, limits = robot.profile.safety, robot.limits
+        usable = 1.0 - safety.cap_margin
+        self._dt = robot.period_ns * 1e-9
+        self._tool = model.tool
+        self.velocity_cap = usable * limits.velocity
+        self.acceleration_cap = usable * limits.acceleration
+        self.sphere = BoundingSphere(robot.profile)
+        self._projects = safety.sphere == "projection"
+        self._n = robot.dof
+        # Upper and mirrored lower bounds side by side: one vector operation serves both.
+        margin = safety.position_margin
+        self._edge = np.concatenate([limits.upper - margin, -(limits.lower + margin)])
+        self._brake2 = np.concatenate([self.acceleration_cap, self.acceleration_cap])
+        self._cap2 = np.concatenate([self.velocity_cap, self.velocity_cap])
+        self._mirrored = np.empty(2 * self._n)
+        self._step = self.acceleration_cap * self._dt
+        self._half_step2 = 0.5 * self._brake2 * self._dt
+        self._reach = model.reach
+        self._hessian = np.eye(self._n)
+        self._sense = np.zeros(self._n + 1, dtype=np.int32)
+        self._sense[-1] = _SOFT
+        self._bounds = np.empty((2, self._n + 1))
+        self._bounds[0, -1] = -1e30
+
+    def step(self, position: Vector, velocity: Vector, wanted: Vector, tool: Vector, jacobian: Vector) -> Shaped:
+        """Return the reference velocity of the next step.
+
+        Args:
+            position: reference (n,), rad.
+            velocity: reference (n,), rad/s.
+            wanted: velocity to come as close to as the limits allow (n,), rad/s, finite.
+            tool: tool point at `position` (3,), m.
+            jacobian: its translational Jacobian (3, n).
+        """
+        lower, upper, clip = self._box(position, velocity, wanted)
+        best = np.minimum(np.maximum(wanted, lower), upper)
+        row = self.sphere.row(tool, jacobian)
+        if row is not None and float(row.normal @ best) > row.bound:
+            clip |= Clip.SPHERE
+            best = self._into_sphere(best, wanted, lower, upper, row, tool, jacobian)
+        if not self._stops_inside(position, velocity, best, tool):
+            clip |= Clip.PREDICTED_STOP
+            best = self.brake(velocity)
+        return Shaped(best, clip)
+
+    def brake(self, velocity: Vector) -> Vector:
+        """Return the velocity after one step of braking every joint at its cap."""
+        return velocity - np.minimum(np.maximum(velocity, -self._step), self._step)
+
+    def _box(self, position: Vector, velocity: Vector, wanted: Vector) -> tuple[Vector, Vector, Clip]:
+        n, dt = self._n, self._dt
+        mirrored = self._mirrored
+        np.add(position, 0.5 * dt * velocity, out=mirrored[:n])
+        np.negative(mirrored[:n], out=mirrored[n:])
+        room = self._edge - mirrored
+        # v dt/2 + v^2/(2 a) <= room, solved for v; past the edge the step has to lead back by v dt/2 = room.
+        root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * np.maximum(room, 0.0)) - self._half_step2
+        bound = np.minimum(np.where(room >= 0.0, root, (2.0 / dt) * room), self._cap2)
+        upper, lower = bound[:n], -bound[n:]
+        clip = Clip.NONE
+        if (wanted > upper).any() or (wanted < lower).any():
+            clip = Clip.POSITION if (np.abs(wanted) <= self.velocity_cap).all() else Clip.VELOCITY | Clip.POSITION
+        least, most = velocity - self._step, velocity + self._step
+        return np.minimum(np.maximum(lower, least), most), np.maximum(np.minimum(upper, most), least), clip
+
+    def _into_sphere(
+        self, best: Vector, wanted: Vector, lower: Vector, upper: Vector, row: Row, tool: Vector, jacobian: Vector
+    ) -> Vector:
+        if self._projects:
+            projected = self.sphere.project(best, tool, jacobian, self._dt)
+            scale = float((np.abs(projected) / self.velocity_cap).max())
+            return np.minimum(np.maximum(projected / max(1.0, scale), lower), upper)
+        bounds = self._bounds
+        bounds[0, :-1] = lower
+        bounds[1, :-1] = upper
+        bounds[1, -1] = row.bound
+        solution, _, flag, _ = daqp.solve(self._hessian, -wanted, row.normal[np.newaxis], bounds[1], bounds[0], self._sense)
+        if flag not in _SOLVED:
+            return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
+        return np.minimum(np.maximum(solution, lower), upper)
+
+    def _stops_inside(self, position: Vector, velocity: Vector, following: Vector, tool: Vector) -> bool:
+        speed = np.abs(following)
+        braking = 0.5 * speed * following / self.acceleration_cap
+        offset = tool - self.sphere.centre
+        room = self.sphere.radius - float(offset @ offset) ** 0.5
+        # No joint moves the tool further than its travel times the arm's reach.
+        if room > self._reach * float(np.abs(braking).sum() + self._dt * speed.sum()):
+            return True
+        start = position + 0.5 * self._dt * (velocity + following)
+        if not self.sphere.contains(self._tool(start + braking)):
+            return self._returning(start, braking, tool)
+        return self.sphere.contains(self._tool(start + 0.75 * braking)) or self._returning(start, braking, tool)
+
+    def _returning(self, start: Vector, braking: Vector, tool: Vector) -> bool:
+        """Return whether the arm, already outside, stops closer to the centre than it is."""
+        offset = tool - self.sphere.centre
+        ahead = self._tool(start + braking) - self.sphere.centre
+        distance = float(offset @ offset)
+        return distance > self.sphere.radius**2 and float(ahead @ ahead) <= distance
+

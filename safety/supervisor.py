@@ -1,0 +1,187 @@
+"""The supervisor: what state the arm is in, what is let through, and what stops it.
+
+One object for twin and hardware. It reads no clock and does no I/O: samples, targets, requests and the time come in;
+states, trips and admitted targets go out.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Sample, Vector
+from robotctl.safety.admission import Admission
+from robotctl.safety.machine import ENABLED, Event, State, after
+from robotctl.safety.protections import DriveHealth, FeedbackAge, PositionBreach, SphereBreach, TrackingError
+from robotctl.safety.target import Hold, Target
+from robotctl.safety.trip import Category, Protection, Trip
+
+_TRIP_EVENTS = {
+    Category.BRAKE_HOLD: Event.TRIP_HOLD,
+    Category.BRAKE_OFF: Event.TRIP_OFF,
+    Category.CUT: Event.TRIP_CUT,
+}
+_RECOVERABLE = (Protection.POSITION, Protection.SPHERE)
+"""After these, acknowledging permits nothing but the retreat."""
+_STANDSTILL_TICKS = 5
+_STOP_ALLOWANCE_S = 0.5
+
+
+class Reaction(NamedTuple):
+    """A trip together with when the arm was first told to stop."""
+
+    trip: Trip
+    stamp_ns: int
+
+    @property
+    def reaction_ms(self) -> float:
+        return (self.stamp_ns - self.trip.onset_ns) / 1e6
+
+
+class Supervisor:
+    """State machine, protections and admission of one arm."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.state = State.OFF
+        self.epoch = 0
+        """Raised by every stop and every entry to ARMED; targets of an older epoch are dropped."""
+        self.category: Category | None = None
+        """Of the stop in progress or in force."""
+        self.cause: Trip | None = None
+        """The trip that is latched, if the arm was not stopped by its operator."""
+        self.recovery = False
+        """Whether only the retreat routine may move the arm."""
+        self.reactions: list[Reaction] = []
+        """Every trip of this supervisor's life, oldest first; the arm's black box."""
+        self.admission = Admission(robot)
+        self.feedback = FeedbackAge(robot)
+        self._position = PositionBreach(robot)
+        self._sphere = SphereBreach(robot)
+        self._tracking = TrackingError(robot)
+        self._drives = DriveHealth()
+        self._standstill = robot.profile.safety.standstill
+        self._grace_ns = round(robot.profile.safety.heartbeat_grace_s * 1e9)
+        self._stopping_limit_ns = round((robot.stopping_time_s + _STOP_ALLOWANCE_S) * 1e9)
+        self._stopping_since_ns: int | None = None
+        self._settled = 0
+        self._was_running = False
+
+    # -- what happens to it ---------------------------------------------------------------------------------------
+
+    def handle(self, event: Event) -> State:
+        """Take one event.
+
+        Raises:
+            Refused: if the present state does not allow it.
+        """
+        before, self.state = self.state, after(self.state, event)
+        match event:
+            case Event.STOP | Event.DISARM:
+                self._raise_epoch(Category.BRAKE_HOLD if event is Event.STOP else Category.BRAKE_OFF)
+            case Event.ARM | Event.ACK | Event.RESET_DONE | Event.OFF_CLEAN:
+                self._raise_epoch(None)
+                if event is Event.ACK:
+                    self.recovery = self.cause is not None and self.cause.protection in _RECOVERABLE
+                    self.cause = None
+                elif event is Event.RESET_DONE:
+                    self.recovery = False
+            case Event.CLEARED:
+                self.category = None
+                self.cause = None
+        if before is not self.state:
+            self._settled = 0
+        return self.state
+
+    def trip(self, trip: Trip, now_ns: int) -> bool:
+        """Stop the arm for `trip`; a trip that is softer than the stop in force changes nothing.
+
+        Returns whether it took effect.
+        """
+        event = _TRIP_EVENTS[trip.category]
+        harder = self.category is None or trip.category < self.category
+        if self.state in ENABLED and harder and not (event is Event.TRIP_HOLD and self.state not in _SOFT_TRIPPABLE):
+            self._was_running = self.state is State.RUN
+            self.state = after(self.state, event)
+            self._raise_epoch(trip.category)
+            self._settled = 0
+        elif self.state is State.READY and trip.category is not Category.BRAKE_HOLD:
+            self.state = after(self.state, event)
+        else:
+            return False
+        self.cause = trip
+        self.reactions.append(Reaction(trip, now_ns))
+        return True
+
+    # -- asked in every tick --------------------------------------------------------------------------------------
+
+    def observe(self, sample: Sample, tool: Vector, reference: Vector, now_ns: int) -> None:
+        """Judge a sample: trips, standstill, automatic clearing.
+
+        Args:
+            tool: measured tool point (3,), m.
+            reference: where the drives are led (n,), rad.
+        """
+        state = self.state
+        if state not in ENABLED:
+            return
+        trip = (
+            self._drives.check(sample, expect_enabled=True)
+            or self.feedback.check(sample, now_ns)
+            or (None if self.recovery else self._position.check(sample))
+            or (None if self.recovery else self._sphere.check(tool, sample.stamp_ns))
+            or self._tracking.check(sample, reference)
+        )
+        if trip is None and state is State.RUN:
+            trip = self.admission.heartbeat(now_ns)
+        if trip is not None:
+            self.trip(trip, now_ns)
+        if self.state is State.STOPPING:
+            self._watch_standstill(sample, now_ns)
+        else:
+            self._stopping_since_ns = None
+        if self.state in (State.STOPPING, State.HOLD):
+            self._clear_heartbeat(now_ns)
+
+    def offer(self, target: Target, now_ns: int) -> None:
+        """Take a new target from the mailbox; malformed ones stop the arm."""
+        if self.state in _LISTENING:
+            trip = self.admission.offer(target, self.epoch, now_ns)
+            if trip is not None:
+                self.trip(trip, now_ns)
+
+    def admitted(self, now_ns: int) -> Target | None:
+        """Return the policy's target if it may move the arm now; None means brake and hold."""
+        if self.state is not State.RUN or self.feedback.stale:
+            return None
+        target = self.admission.fresh(now_ns)
+        return None if isinstance(target, Hold) else target
+
+    # -- inside ---------------------------------------------------------------------------------------------------
+
+    def _raise_epoch(self, category: Category | None) -> None:
+        self.epoch += 1
+        self.category = category
+
+    def _watch_standstill(self, sample: Sample, now_ns: int) -> None:
+        if self._stopping_since_ns is None:
+            self._stopping_since_ns = now_ns
+        at_rest = bool((np.abs(sample.velocity) < self._standstill).all())
+        self._settled = self._settled + 1 if at_rest else 0
+        # A joint that is not heard of, or that somebody shakes, must not keep a stop from ending.
+        overdue = now_ns - self._stopping_since_ns > self._stopping_limit_ns
+        if self._settled >= _STANDSTILL_TICKS or overdue:
+            self.handle(Event.STANDSTILL_HOLD if self.category is Category.BRAKE_HOLD else Event.STANDSTILL_OFF)
+
+    def _clear_heartbeat(self, now_ns: int) -> None:
+        """A heartbeat that comes back in time resumes; later the stop is latched."""
+        cause = self.cause
+        if cause is None or cause.protection is not Protection.HEARTBEAT or not self._was_running:
+            return
+        if now_ns - cause.onset_ns > self._grace_ns:
+            self._was_running = False
+        elif self.admission.fresh(now_ns) is not None:
+            self.handle(Event.CLEARED)
+
+
+_SOFT_TRIPPABLE = (State.ARMED, State.RUN, State.RESET)
+_LISTENING = (State.RUN, State.STOPPING, State.HOLD)
