@@ -22,6 +22,8 @@ class VelocityLimiter:
         self._input.synchronization = ruckig.Synchronization.No
         self._input.max_acceleration = self._acceleration
         self._input.max_jerk = robot.limits.jerk
+        self._answered: Vector | None = None
+        self._wanted: Vector | None = None
 
     def step(self, wanted: Vector, velocity: Vector, acceleration: Vector) -> Vector:
         """Return the velocity (n,) one servo period on, rad/s.
@@ -31,12 +33,18 @@ class VelocityLimiter:
             velocity: of the reference (n,).
             acceleration: of the reference (n,).
         """
-        request = self._input
-        request.current_velocity = velocity
-        request.current_acceleration = np.minimum(np.maximum(acceleration, -self._acceleration), self._acceleration)
-        request.target_velocity = np.minimum(np.maximum(wanted, -self.cap), self.cap)
-        self._generator.update(request, self._output)
-        return np.array(self._output.new_velocity)
+        request, answer = self._input, self._output
+        if velocity is self._answered:
+            answer.pass_to_input(request)  # nobody changed the last answer: cheaper than handing it over again
+        else:
+            request.current_velocity = velocity
+            request.current_acceleration = np.minimum(np.maximum(acceleration, -self._acceleration), self._acceleration)
+        if wanted is not self._wanted:
+            request.target_velocity = np.minimum(np.maximum(wanted, -self.cap), self.cap)
+            self._wanted = wanted
+        self._generator.update(request, answer)
+        self._answered = np.array(answer.new_velocity)
+        return self._answered
 
 
 class TorqueLimiter:

@@ -18,7 +18,7 @@ from robotctl.hal.backend import Rig
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import RobotctlError
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Command, CommandMode, Sample, Vector
+from robotctl.hal.types import Command, CommandMode, Sample, Truth, Vector
 from robotctl.safety.machine import ENABLED, Event, Refused, State
 from robotctl.safety.routines import Goto, Retreat, Routine, Settle
 from robotctl.safety.shaper import Clip, Shaper
@@ -69,6 +69,7 @@ class Loop:
         self._routine: Routine | None = None
         self._routine_ends_ns = 0
         self._zero = np.zeros(robot.dof)
+        self._no_truth = Truth(self._zero, self._zero, self._zero, np.zeros(3))
         self._torque: Vector | None = None
         self._clip = Clip.NONE
         self._wanted: Vector = self._zero
@@ -76,6 +77,7 @@ class Loop:
         self._estop: str = ""
         self._damping = False
         self._lowering_ns: int | None = None
+        self._closing = False
         self._ticks = 0
         self._reported = 0
         self._state = State.OFF
@@ -101,6 +103,15 @@ class Loop:
             finally:
                 self._arm.close()
 
+    def bus_statistics(self) -> dict[str, object] | None:
+        """Return the counters of the arm's bus, if it has one."""
+        return self._arm.bus_statistics()
+
+    def request(self, verb: Verb) -> None:
+        """Ask for something as the operator would, from within this process."""
+        if self._link.desk.pending() is None:
+            self._link.desk.ask(verb)
+
     def estop(self, source: str) -> None:
         """Ask for an emergency stop in the next tick. May be called from a signal handler."""
         self._estop = source
@@ -111,13 +122,15 @@ class Loop:
         """Do everything that is due in one servo period."""
         now = self._clock.now_ns()
         supervisor = self.supervisor
-        sample = self._arm.read()
-        tool = self.kinematics.tool(sample.position)
         if self._estop:
             self._serve_estop(now)
         request = self._link.desk.pending()
         if request is not None:
-            self._serve(*request, sample, now)
+            self._serve(*request, now)
+            if self.closed:
+                return
+        sample = self._arm.read()
+        tool = self.kinematics.tool(sample.position)
         supervisor.observe(sample, tool, self._reference.position, now)
         target = self._link.mailbox.take()
         if target is not None:
@@ -188,7 +201,7 @@ class Loop:
         clean = self.supervisor.cause is None
         if self.supervisor.state is State.DISABLED:
             self._damping = self.robot.profile.category0 == "damp"
-            if clean:
+            if clean and self._lowering_ns is None:
                 self._lowering_ns = now
             if self._damping and not clean:
                 self.supervisor.handle(Event.OFF_FAULT)
@@ -202,7 +215,10 @@ class Loop:
                 self._arm.write(self._command)
                 return
         self._damping = False
+        self._lowering_ns = None
         self._arm.disable()
+        if self._closing:
+            self._close(now)
         if self.supervisor.state is State.DISABLED:
             self.supervisor.handle(Event.OFF_CLEAN if clean else Event.OFF_FAULT)
 
@@ -223,22 +239,22 @@ class Loop:
 
     # -- the operator ---------------------------------------------------------------------------------------------
 
-    def _serve(self, number: int, verb: int, sample: Sample, now: int) -> None:
+    def _serve(self, number: int, verb: int, now: int) -> None:
         """Carry out one request and answer it. A refused request changes nothing."""
         text = ""
         try:
-            self._carry_out(Verb(verb), sample, now)
+            self._carry_out(Verb(verb), now)
         except (Refused, RobotctlError) as error:
             text = str(error)
         self._link.events.write({"type": "answer", "stamp_ns": now, "number": number, "ok": not text, "text": text})
         self._link.desk.answer(number)
 
-    def _carry_out(self, verb: Verb, sample: Sample, now: int) -> None:
+    def _carry_out(self, verb: Verb, now: int) -> None:
         supervisor = self.supervisor
         match verb:
             case Verb.ARM:
                 supervisor.handle(Event.ARM)
-                self._enable(sample)
+                self._enable(now)
             case Verb.START:
                 supervisor.handle(Event.START)
                 supervisor.admission.renew(now)
@@ -277,19 +293,20 @@ class Loop:
         self._arm.verify()
         self.supervisor.handle(Event.SELFTEST)
 
-    def _enable(self, sample: Sample) -> None:
+    def _enable(self, now: int) -> None:
         try:
-            self._reference.resync(sample.position, self._zero)
             self._arm.enable()
         except RobotctlError as error:
-            trip = Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), sample.stamp_ns)
-            self.supervisor.trip(trip, sample.stamp_ns)
+            self.supervisor.trip(Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), now), now)
             raise
+        self._reference.resync(self._arm.read().position, self._zero)
 
     def _close(self, now: int) -> None:
-        if self._damping and self._lowering_ns is None:
-            self._lowering_ns = now
-        if not self._damping:
+        """Release the arm at once, or after a damped one was lowered."""
+        if self._damping:
+            self._closing = True
+            self._lowering_ns = self._lowering_ns or now
+        else:
             self.supervisor.handle(Event.CLOSE)
             self.shut_down()
 
@@ -322,28 +339,34 @@ class Loop:
             self._state = supervisor.state
 
     def _publish(self, sample: Sample, tool: Vector, now: int) -> None:
-        ring = self._link.ticks
-        record = ring.records[self._ticks % ring.slots]
-        record["tick"] = self._ticks
-        record["stamp_ns"] = now
-        record["lateness_ns"] = self.lateness_ns
-        record["epoch"] = self.supervisor.epoch
-        record["state"] = self.supervisor.state
-        record["clip"] = self._clip
-        record["position"] = sample.position
-        record["velocity"] = sample.velocity
-        record["effort"] = sample.effort
-        record["wanted"] = self._wanted
-        record["command_position"] = self._command.position
-        record["command_velocity"] = self._command.velocity
-        record["command_effort"] = self._command.effort
-        record["tool"] = tool
+        supervisor, command, ring = self.supervisor, self._command, self._link.ticks
         truth = self._arm.truth()
-        record["has_truth"] = truth is not None
-        if truth is not None:
-            record["true_position"] = truth.position
-            record["true_velocity"] = truth.velocity
-            record["true_tool"] = truth.tool
+        true = truth or self._no_truth
+        ring.fill(
+            self._ticks,
+            (
+                self._ticks,
+                now,
+                self.lateness_ns,
+                supervisor.epoch,
+                supervisor.admission.seq,
+                supervisor.state,
+                self._clip,
+                truth is not None,
+            ),
+            (
+                sample.position,
+                sample.velocity,
+                sample.effort,
+                self._wanted,
+                command.position,
+                command.velocity,
+                command.effort,
+                tool,
+                true.position,
+                true.velocity,
+                true.tool,
+            ),
+        )
+        ring.publish(self._ticks, self._clock.now_ns() - now)
         self._ticks += 1
-        record["duration_ns"] = self._clock.now_ns() - now
-        ring.publish(self._ticks)

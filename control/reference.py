@@ -34,6 +34,7 @@ class Reference:
         self._bias_cap = _BIAS_SHARE * self._cap
         self._bias = np.zeros(n)
         self._velocity_cap = robot.limits.velocity
+        self._rubs = bool(kinematics.friction.any())
 
     def resync(self, position: Vector, velocity: Vector) -> None:
         """Start anew from a state: measured after any loss of hold, the reference's own while the drives hold."""
@@ -53,14 +54,14 @@ class Reference:
         self.position = self.position + (0.5 * dt) * (self.velocity + velocity)
         self.velocity = velocity
         effort = kinematics.inverse_dynamics(self.position, velocity, self.acceleration)
-        effort += kinematics.damping * velocity + kinematics.friction * np.tanh(velocity / _SLOW)
-        self._integrate(measured)
-        effort = np.minimum(np.maximum(effort + self._bias, -self._cap), self._cap)
-        return Command(CommandMode.TRACK, self.position, velocity, effort)
+        effort += kinematics.damping * velocity + self._bias
+        if self._rubs:
+            effort += kinematics.friction * np.tanh(velocity / _SLOW)
+        if velocity @ velocity < _SLOW**2:
+            self._integrate(measured)
+        return Command(CommandMode.TRACK, self.position, velocity, np.minimum(np.maximum(effort, -self._cap), self._cap))
 
     def _integrate(self, measured: Vector) -> None:
         error = self.position - measured
-        resting = (np.abs(self.velocity) < _SLOW) & (np.abs(error) > _DEADBAND)
-        if resting.any():
-            bias = self._bias + self._ki * error * resting
-            self._bias = np.minimum(np.maximum(bias, -self._bias_cap), self._bias_cap)
+        bias = self._bias + self._ki * error * (np.abs(error) > _DEADBAND)
+        self._bias = np.minimum(np.maximum(bias, -self._bias_cap), self._bias_cap)

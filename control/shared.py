@@ -109,19 +109,23 @@ class Desk:
         _HEAD.pack_into(self._buffer, self._offset + 8, number)
 
 
+TICK_HEAD = struct.Struct("<qqqqqqqq")
+"""The integer fields of a record, in order."""
+
+
 def tick_dtype(dof: int) -> np.dtype[Any]:
-    """Return the record that every tick leaves behind."""
+    """Return the record that every tick leaves behind: integers first, then one run of doubles."""
     joints = (np.float64, (dof,))
     return np.dtype(
         [
             ("tick", np.int64),
             ("stamp_ns", np.int64),
             ("lateness_ns", np.int64),
-            ("duration_ns", np.int64),
             ("epoch", np.int64),
             ("seq", np.int64),
-            ("state", np.int32),
-            ("clip", np.int32),
+            ("state", np.int64),
+            ("clip", np.int64),
+            ("has_truth", np.int64),
             ("position", *joints),
             ("velocity", *joints),
             ("effort", *joints),
@@ -130,11 +134,10 @@ def tick_dtype(dof: int) -> np.dtype[Any]:
             ("command_velocity", *joints),
             ("command_effort", *joints),
             ("tool", np.float64, (3,)),
-            ("has_truth", np.int64),
             ("true_position", *joints),
             ("true_velocity", *joints),
             ("true_tool", np.float64, (3,)),
-            ("gripper_width", np.float64),
+            ("duration_ns", np.int64),
         ]
     )
 
@@ -148,6 +151,9 @@ class TickRing:
         self.slots = slots
         self.dtype = tick_dtype(dof)
         self.records: NDArray[Any] = np.frombuffer(buffer, self.dtype, slots, offset + 64)
+        # The run of doubles of each record: joints nine times, the tool point twice.
+        words = self.dtype.itemsize // 8
+        self._doubles = np.frombuffer(buffer, np.float64, slots * words, offset + 64).reshape(slots, words)[:, 8:-1]
 
     @staticmethod
     def size(dof: int, slots: int) -> int:
@@ -158,9 +164,17 @@ class TickRing:
         """Number of records written so far."""
         return int(_HEAD.unpack_from(self._buffer, self._offset)[0])
 
-    def publish(self, head: int) -> None:
-        """Make record `head - 1` visible."""
-        _HEAD.pack_into(self._buffer, self._offset, head)
+    def fill(self, number: int, head: tuple[int, ...], vectors: tuple[Vector, ...]) -> None:
+        """Write the fields of record `number`, in the order of `tick_dtype`, all but the last; not yet visible."""
+        slot = number % self.slots
+        TICK_HEAD.pack_into(self._buffer, self._offset + 64 + slot * self.dtype.itemsize, *head)
+        np.concatenate(vectors, out=self._doubles[slot])
+
+    def publish(self, number: int, duration_ns: int) -> None:
+        """Complete record `number` with how long its tick took, and make it visible."""
+        end = self._offset + 64 + (number % self.slots + 1) * self.dtype.itemsize
+        struct.pack_into("<q", self._buffer, end - 8, duration_ns)
+        _HEAD.pack_into(self._buffer, self._offset, number + 1)
 
     def latest(self) -> np.void | None:
         """Return a copy of the newest record, or None before the first."""
@@ -252,9 +266,7 @@ class Link:
         return cls._lay_out(bytearray(Mailbox.SIZE), bytearray(cls._board_size(dof, slots)), dof, slots, None)
 
     @classmethod
-    def _lay_out(
-        cls, mailbox: Buffer, board: Buffer, dof: int, slots: int, fds: tuple[int, int] | None
-    ) -> Self:
+    def _lay_out(cls, mailbox: Buffer, board: Buffer, dof: int, slots: int, fds: tuple[int, int] | None) -> Self:
         return cls(
             Mailbox(mailbox),
             Desk(board, 0),
@@ -266,6 +278,25 @@ class Link:
     @staticmethod
     def _board_size(dof: int, slots: int) -> int:
         return 64 + EventRing.SIZE + TickRing.size(dof, slots)
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """The rings alone, for who only looks on: a recorder, a viewer."""
+
+    events: EventRing
+    ticks: TickRing
+
+    @classmethod
+    def attach(cls, fd: int, dof: int, slots: int) -> Self:
+        """Map the board behind a descriptor, which may be read-only, so that it cannot be written to."""
+        board = mmap.mmap(fd, Link._board_size(dof, slots), access=mmap.ACCESS_READ)
+        return cls(EventRing(board, 64), TickRing(board, 64 + EventRing.SIZE, dof, slots))
+
+    @staticmethod
+    def read_only(fd: int) -> int:
+        """Return a new descriptor of a board that allows reading only."""
+        return os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
 
 
 def vector(record: np.void, field: str) -> Vector:

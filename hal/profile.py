@@ -141,6 +141,8 @@ class Safety(_Strict):
     """Measured distance past a soft limit at which the arm is stopped, rad (0.5 degrees)."""
     cap_margin: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.03
     """Fraction of the velocity and acceleration caps that commands leave unused; covers the tracking error."""
+    velocity_tolerance: Positive = 0.05
+    """Published tolerance: how far true joint speed may exceed its cap, rad/s."""
     tracking_error: Positive = 0.15
     """Distance between reference and measurement at which the arm is stopped, rad."""
     heartbeat_s: Positive = 0.1

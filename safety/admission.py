@@ -20,7 +20,8 @@ class Admission:
         self._heartbeat_ns = round(safety.heartbeat_s * 1e9)
         self._window_ns = round(safety.malformed_window_s * 1e9)
         self._malformed: deque[int] = deque(maxlen=_MALFORMED_TO_FAULT)
-        self._seq = -1
+        self.seq = -1
+        """Sequence number of the last target let in."""
         self._target: Target | None = None
         self._expires_ns = 0
         self.refused = 0
@@ -40,10 +41,10 @@ class Admission:
         complaint = self._complaint(target)
         if complaint:
             return self._malformed_trip(complaint, now_ns)
-        if target.epoch != epoch or target.seq <= self._seq or target.deadline_ns <= now_ns:
+        if target.epoch != epoch or target.seq <= self.seq or target.deadline_ns <= now_ns:
             self.refused += 1
             return None
-        self._seq = target.seq
+        self.seq = target.seq
         self._target = target
         self._expires_ns = min(target.deadline_ns, now_ns + self._heartbeat_ns)
         return None

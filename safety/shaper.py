@@ -76,12 +76,18 @@ class Shaper:
         # Upper and mirrored lower bounds side by side: one vector operation serves both.
         margin = safety.position_margin
         self._edge = np.concatenate([limits.upper - margin, -(limits.lower + margin)])
-        self._brake2 = np.concatenate([self.acceleration_cap, self.acceleration_cap])
-        self._cap2 = np.concatenate([self.velocity_cap, self.velocity_cap])
+        self._brake2 = np.tile(self.acceleration_cap, 2)
+        self._cap2 = np.tile(self.velocity_cap, 2)
+        self._half_step2 = 0.5 * self._brake2 * self._dt
+        # Where a joint is further from its limit than braking from the cap takes, the limit asks for nothing.
+        self._free = self._edge - self._cap2 * (0.5 * self._dt + self._cap2 / (2.0 * self._brake2))
         self._mirrored = np.empty(2 * self._n)
         self._step = self.acceleration_cap * self._dt
-        self._half_step2 = 0.5 * self._brake2 * self._dt
-        self._reach = model.reach
+        # A hair wider, so that the limiter's own full acceleration does not count as clipped for a rounding error.
+        self._change = self._step * (1.0 + 1e-9)
+        # Bounds on how fast, and how far until it rests, the tool can move per unit of joint speed.
+        self._speed_reach = np.full(self._n, model.reach)
+        self._travel_reach = model.reach * (self._dt + self.velocity_cap / (2.0 * self.acceleration_cap))
         self._hessian = np.eye(self._n)
         self._sense = np.zeros(self._n + 1, dtype=np.int32)
         self._sense[-1] = _SOFT
@@ -98,13 +104,21 @@ class Shaper:
             tool: tool point at `position` (3,), m.
             jacobian: its translational Jacobian (3, n).
         """
-        lower, upper, clip = self._box(position, velocity, wanted)
-        best = np.minimum(np.maximum(wanted, lower), upper)
-        row = self.sphere.row(tool, jacobian)
-        if row is not None and float(row.normal @ best) > row.bound:
-            clip |= Clip.SPHERE
-            best = self._into_sphere(best, wanted, lower, upper, row, tool, jacobian)
-        if not self._stops_inside(position, velocity, best, tool):
+        lower, upper = self._box(position, velocity)
+        best, clip = np.minimum(np.maximum(wanted, lower), upper), Clip.NONE
+        if (best == wanted).all():
+            best = wanted
+        else:
+            clip = Clip.POSITION if (np.abs(wanted) <= self.velocity_cap).all() else Clip.VELOCITY
+        speed = np.abs(best)
+        room = self.sphere.room(tool)
+        if self.sphere.gain * room < float(self._speed_reach @ speed):
+            row = self.sphere.row(tool, jacobian)
+            if row is not None and float(row.normal @ best) > row.bound:
+                clip |= Clip.SPHERE
+                best = self._into_sphere(best, wanted, lower, upper, row, tool, jacobian)
+                speed = np.abs(best)
+        if room < float(self._travel_reach @ speed) and not self._stops_inside(position, velocity, best, tool):
             clip |= Clip.PREDICTED_STOP
             best = self.brake(velocity)
         return Shaped(best, clip)
@@ -113,21 +127,25 @@ class Shaper:
         """Return the velocity after one step of braking every joint at its cap."""
         return velocity - np.minimum(np.maximum(velocity, -self._step), self._step)
 
-    def _box(self, position: Vector, velocity: Vector, wanted: Vector) -> tuple[Vector, Vector, Clip]:
+    def _box(self, position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
         n, dt = self._n, self._dt
         mirrored = self._mirrored
-        np.add(position, 0.5 * dt * velocity, out=mirrored[:n])
+        np.add(position, (0.5 * dt) * velocity, out=mirrored[:n])
         np.negative(mirrored[:n], out=mirrored[n:])
-        room = self._edge - mirrored
-        # v dt/2 + v^2/(2 a) <= room, solved for v; past the edge the step has to lead back by v dt/2 = room.
-        root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * np.maximum(room, 0.0)) - self._half_step2
-        bound = np.minimum(np.where(room >= 0.0, root, (2.0 / dt) * room), self._cap2)
+        bound = self._cap2 if (mirrored <= self._free).all() else self._position_bound(mirrored)
         upper, lower = bound[:n], -bound[n:]
-        clip = Clip.NONE
-        if (wanted > upper).any() or (wanted < lower).any():
-            clip = Clip.POSITION if (np.abs(wanted) <= self.velocity_cap).all() else Clip.VELOCITY | Clip.POSITION
-        least, most = velocity - self._step, velocity + self._step
-        return np.minimum(np.maximum(lower, least), most), np.maximum(np.minimum(upper, most), least), clip
+        # The acceleration caps come last: a reference that is past a bound is led back as fast as they allow.
+        least, most = velocity - self._change, velocity + self._change
+        return np.minimum(np.maximum(lower, least), most), np.maximum(np.minimum(upper, most), least)
+
+    def _position_bound(self, mirrored: Vector) -> Vector:
+        """Return the speed towards each limit from which braking ends there: v dt/2 + v^2/(2 a) <= room.
+
+        Past the edge the step has to lead back: v dt/2 = room.
+        """
+        room = self._edge - mirrored
+        root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * np.maximum(room, 0.0)) - self._half_step2
+        return np.minimum(np.where(room >= 0.0, root, (2.0 / self._dt) * room), self._cap2)
 
     def _into_sphere(
         self, best: Vector, wanted: Vector, lower: Vector, upper: Vector, row: Row, tool: Vector, jacobian: Vector
@@ -146,22 +164,11 @@ class Shaper:
         return np.minimum(np.maximum(solution, lower), upper)
 
     def _stops_inside(self, position: Vector, velocity: Vector, following: Vector, tool: Vector) -> bool:
-        speed = np.abs(following)
-        braking = 0.5 * speed * following / self.acceleration_cap
-        offset = tool - self.sphere.centre
-        room = self.sphere.radius - float(offset @ offset) ** 0.5
-        # No joint moves the tool further than its travel times the arm's reach.
-        if room > self._reach * float(np.abs(braking).sum() + self._dt * speed.sum()):
-            return True
-        start = position + 0.5 * self._dt * (velocity + following)
-        if not self.sphere.contains(self._tool(start + braking)):
-            return self._returning(start, braking, tool)
-        return self.sphere.contains(self._tool(start + 0.75 * braking)) or self._returning(start, braking, tool)
-
-    def _returning(self, start: Vector, braking: Vector, tool: Vector) -> bool:
-        """Return whether the arm, already outside, stops closer to the centre than it is."""
-        offset = tool - self.sphere.centre
-        ahead = self._tool(start + braking) - self.sphere.centre
-        distance = float(offset @ offset)
-        return distance > self.sphere.radius**2 and float(ahead @ ahead) <= distance
-
+        """Return whether braking from `following` ends inside the sphere or, already outside, no further out."""
+        braking = 0.5 * np.abs(following) * following / self.acceleration_cap
+        start = position + (0.5 * self._dt) * (velocity + following)
+        allowed = min(0.0, self.sphere.room(tool))
+        return (
+            self.sphere.room(self._tool(start + braking)) >= allowed
+            and self.sphere.room(self._tool(start + 0.75 * braking)) >= allowed
+        )

@@ -36,10 +36,10 @@ class BoundingSphere:
         self.gain = profile.safety.sphere_gain
         self._square = self.radius**2
 
-    def contains(self, tool: Vector) -> bool:
-        """Return whether the point (3,) is inside."""
+    def room(self, tool: Vector) -> float:
+        """Return the distance from the point (3,) to the surface, m; negative outside."""
         offset = tool - self.centre
-        return bool(offset @ offset <= self._square)
+        return self.radius - float(offset @ offset) ** 0.5
 
     def row(self, tool: Vector, jacobian: Vector) -> Row | None:
         """Return the row at a tool point (3,) with Jacobian (3, n); None at the centre."""

@@ -35,7 +35,7 @@ class StoppableMotion:
         joint = int(fast.argmax())
         if fast[joint] > 0.0:
             return self._trip(f"{self._names[joint]} moves at {speed[joint]:.2f} rad/s, over its cap", sample)
-        if not (self._sphere.contains(self._tool(stop)) and self._sphere.contains(self._tool(sample.position + 0.5 * ahead))):
+        if min(self._sphere.room(self._tool(stop)), self._sphere.room(self._tool(sample.position + 0.5 * ahead))) < 0.0:
             return self._trip("the tool would stop outside its sphere", sample)
         return None
 

@@ -36,6 +36,8 @@ class SimArm(Arm):
         self._kp = np.array([gain.kp for gain in gains])
         self._kd = np.array([gain.kd for gain in gains])
         self._none = np.zeros(robot.dof)
+        self._ones = np.ones(robot.dof, dtype=np.int64)
+        self._truth = plant.truth()
         self._delay_ns = round(self._twin.delay_s * 1e9)
         self._noisy = self._twin.noise_position > 0.0 or self._twin.noise_velocity > 0.0
         self._waiting: deque[tuple[int, Command]] = deque()
@@ -53,20 +55,21 @@ class SimArm(Arm):
         if not self._enabled:
             self._plant.advance(self._clock.now_ns())
             self._enabled = True
-            self._apply(self._holding())
+            holding = self._holding()
             for axis in range(self._plant.dof):
+                self._plant.drive(axis, self._kp[axis], self._kd[axis], holding.position[axis], 0.0, holding.effort[axis])
                 self._plant.settle_lag(axis)
 
     def read(self) -> Sample:
         self._require_connected()
         now = self._clock.now_ns()
         self._deliver(now)
-        truth = self._plant.truth()
+        truth = self._truth = self._plant.truth()
         position, velocity = truth.position, truth.velocity
         if self._noisy:
             position = position + self._rng.normal(0.0, self._twin.noise_position, position.shape)
             velocity = velocity + self._rng.normal(0.0, self._twin.noise_velocity, velocity.shape)
-        return Sample(now, position, velocity, truth.effort, np.full(self._plant.dof, now), (), self._enabled)
+        return Sample(now, position, velocity, truth.effort, self._ones * now, (), self._enabled)
 
     def write(self, command: Command) -> Sent:
         if not self._enabled:
@@ -94,7 +97,8 @@ class SimArm(Arm):
         self._connected = False
 
     def truth(self) -> Truth:
-        return self._plant.truth()
+        """Return the true state at the last `read`."""
+        return self._truth
 
     def _holding(self) -> Command:
         position = self._plant.truth().position

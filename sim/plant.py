@@ -10,6 +10,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.profile import GripperProfile, RobotProfile
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Truth, Vector
@@ -47,9 +48,22 @@ class Plant:
         ids = [self.model.joint(name).id for name in joints]
         self._qpos = np.array([self.model.jnt_qposadr[i] for i in ids])
         self._dofs = np.array([self.model.jnt_dofadr[i] for i in ids])
-        self._actuators = np.array(actuators)
+        # The arm comes first in every model this package builds, so that its state is a slice.
+        if list(self._qpos[: self.dof]) != list(range(self.dof)):
+            raise ConfigError(f"{robot.source}: the arm's joints must be the first of the model")
         self._tool_site = self.model.site("robotctl_tool").id
-        self._friction = self.model.dof_frictionloss.copy()
+        self._free_friction = self.model.dof_frictionloss.copy()
+        self._friction = self._free_friction.copy()
+        self._largest = self.model.actuator_forcerange[:, 1].copy()
+        # Views of MuJoCo's own memory: an item of a memoryview costs a tenth of an item of its arrays, and emulated
+        # drives set and read one axis at a time, thousands of times a second.
+        self._bias_rows = [memoryview(self.model.actuator_biasprm[actuator]) for actuator in actuators]
+        self._friction_view = memoryview(self.model.dof_frictionloss)
+        self._ctrl_view = memoryview(self.data.ctrl)
+        self._force_view = memoryview(self.data.actuator_force)
+        self._qpos_view = memoryview(self.data.qpos)
+        self._qvel_view = memoryview(self.data.qvel)
+        self._addresses = [(int(self._qpos[axis]), int(self._dofs[axis]), actuators[axis]) for axis in range(self.axes)]
         self._lagged = self.model.na > 0
         self._brakes = profile.brakes
         for axis in range(self.axes):
@@ -71,12 +85,12 @@ class Plant:
 
     def drive(self, axis: int, kp: float, kd: float, position: float, velocity: float, effort: float) -> None:
         """Set the law that an enabled drive follows from now on (joint coordinates, SI)."""
-        actuator = self._actuators[axis]
-        bias = self.model.actuator_biasprm[actuator]
+        _, dof, actuator = self._addresses[axis]
+        bias = self._bias_rows[axis]
         bias[1] = -kp
         bias[2] = -kd
-        self.model.dof_frictionloss[self._dofs[axis]] = self._friction[self._dofs[axis]]
-        self.data.ctrl[actuator] = kp * position + kd * velocity + effort
+        self._friction_view[dof] = self._friction[dof]
+        self._ctrl_view[actuator] = kp * position + kd * velocity + effort
 
     def drive_arm(self, kp: Vector, kd: Vector, position: Vector, velocity: Vector, effort: Vector) -> None:
         """Set the law of all arm joints at once; arrays are (n,)."""
@@ -100,18 +114,31 @@ class Plant:
 
     def axis(self, axis: int) -> AxisState:
         """Return the true state of one axis."""
-        return AxisState(
-            float(self.data.qpos[self._qpos[axis]]),
-            float(self.data.qvel[self._dofs[axis]]),
-            float(self.data.actuator_force[self._actuators[axis]]),
-        )
+        qpos, dof, actuator = self._addresses[axis]
+        return AxisState(self._qpos_view[qpos], self._qvel_view[dof], self._force_view[actuator])
+
+    def limit(self, axis: int, effort: float | None) -> None:
+        """Bound the drive of an axis to +-`effort`, Nm or N, never above its largest; None takes the bound away."""
+        largest = float(self._largest[axis])
+        bound = largest if effort is None else min(effort, largest)
+        self.model.actuator_forcerange[self._addresses[axis][2]] = (-bound, bound)
+
+    def inertia(self, axis: int) -> float:
+        """Return the inertia that an axis feels in the model's zero pose, kg m^2 or kg."""
+        return float(self.model.dof_M0[self._dofs[axis]])
+
+    def jam(self, axis: int, jammed: bool) -> None:
+        """Let an axis seize up, or run freely again, whatever its drive does."""
+        dof = self._dofs[axis]
+        self._friction[dof] = _BRAKE_TORQUE if jammed else self._free_friction[dof]
+        self.model.dof_frictionloss[dof] = self._friction[dof]
 
     def truth(self) -> Truth:
         """Return the arm's true state, as copies."""
         n = self.dof
         return Truth(
-            self.data.qpos[self._qpos[:n]],
-            self.data.qvel[self._dofs[:n]],
+            self.data.qpos[:n].copy(),
+            self.data.qvel[:n].copy(),
             self.data.actuator_force[:n].copy(),
             self.data.site_xpos[self._tool_site].copy(),
         )

@@ -1,0 +1,40 @@
+# Everything works from a bare clone: `make run`, `make test`. Both set up .venv first.
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install -qq
+
+.PHONY: run test check format bench clean
+
+run: .venv/run ## reach three targets on the twin
+	$(BIN)/robotctl run --backend sim
+
+test: check ## everything that must pass
+	$(BIN)/python -m pytest -q -n 2 -m "not realtime"
+	$(BIN)/python -m pytest -q -m realtime
+
+check: .venv/dev ## format, lint, types
+	$(BIN)/ruff format --check --diff .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: .venv/dev ## write the format and the fixes that ruff can make
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: .venv/run ## what a tick costs beside the bare library calls
+	$(BIN)/robotctl bench tick
+
+clean:
+	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/run: pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP) -e .
+	touch $@
+
+.venv/dev: pyproject.toml constraints.txt | .venv/bin/python
+	$(PIP) -e .[dev]
+	touch $@ .venv/run

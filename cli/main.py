@@ -1,0 +1,29 @@
+"""The `robotctl` command."""
+
+import typer
+
+from robotctl.cli.bench import bench_app
+from robotctl.cli.doctor import doctor
+from robotctl.cli.emulate import emulate
+from robotctl.cli.run import run
+from robotctl.cli.scan import scan
+from robotctl.cli.stop import stop
+
+app = typer.Typer(
+    help="Run robot arms, on the MuJoCo twin or over CAN, with safety built in.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for verb in (run, stop, scan, doctor, emulate):
+    app.command()(verb)
+app.add_typer(bench_app, name="bench")
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

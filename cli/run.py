@@ -1,0 +1,130 @@
+"""`robotctl run`: let a policy work on a task, on the twin or on hardware."""
+
+import signal
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from robotctl.cli.errors import Exit, readable_errors
+from robotctl.cli.keys import stop_keys
+from robotctl.cli.output import write_json
+from robotctl.control.loop import Verb
+from robotctl.control.process_session import ProcessSession
+from robotctl.control.recording_session import record_session
+from robotctl.control.session import LockstepSession, Session
+from robotctl.hal.robot import load_robot
+from robotctl.learning.actor import Actor, InlineActor, ProcessActor
+from robotctl.learning.policies import POLICIES
+from robotctl.learning.run import Episode, Outcome, report, run_episodes
+from robotctl.learning.task import load_task
+
+
+class Terminated(BaseException):
+    """SIGTERM: somebody wants this to end now."""
+
+
+def run(
+    backend: Annotated[str, typer.Option(help="sim: the MuJoCo twin. can: drives on a CAN bus.")] = "sim",
+    robot: Annotated[str, typer.Option(help="Name of a shipped robot, or path of a profile.")] = "panda",
+    task: Annotated[str, typer.Option(help="Name of a shipped task, or path of a task file.")] = "reach",
+    policy: Annotated[str, typer.Option(help=f"One of {', '.join(POLICIES)}.")] = "scripted",
+    channel: Annotated[
+        str, typer.Option(help="CAN only: emulated, virtual:NAME, socketcan:can0, slcan:DEVICE.")
+    ] = "",
+    episodes: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the targets and of random policies.")] = 0,
+    fast: Annotated[bool, typer.Option("--fast", help="Simulation in lockstep, as fast as the machine allows.")] = False,
+    record: Annotated[Path | None, typer.Option(help="MCAP file to write; default recordings/TIME-ROBOT.mcap.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the report here.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Override a profile key, e.g. twin.lag_s=0.02.")] = None,
+) -> None:
+    """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C stops and parks."""
+    console = Console(highlight=False)
+    overrides = set_ or []
+    with readable_errors():
+        model = load_robot(robot, overrides)
+        work = load_task(task)
+        about = {"backend": backend, "robot": model.profile.name, "task": work.name, "policy": policy, "seed": seed}
+        session: Session
+        actor: Actor
+        if fast:
+            session = LockstepSession(model, backend, channel)
+            actor = InlineActor(session, work, policy, seed)
+        else:
+            session = ProcessSession(model, backend, channel, overrides)
+            actor = ProcessActor(session, work, policy, seed, overrides)
+        path = record or Path("recordings") / f"{datetime.now():%Y%m%d-%H%M%S}-{model.profile.name}-{backend}.mcap"
+        console.print(f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}")
+        outcome, result = _run(console, session, actor, path, about, episodes, seed, work)
+        _summarise(console, result)
+        if json is not None:
+            write_json(json, result)
+    if outcome == Exit.DONE:
+        return
+    raise typer.Exit(outcome)
+
+
+def _run(
+    console: Console,
+    session: Session,
+    actor: Actor,
+    path: Path,
+    about: dict[str, Any],
+    episodes: int,
+    seed: int,
+    task: Any,
+) -> tuple[Exit, dict[str, Any]]:
+    def on_episode(index: int, episode: Episode) -> None:
+        mark = "[green]reached[/]" if episode.success else "[yellow]missed[/] "
+        console.print(f"  episode {index + 1}  {mark}  {1e3 * episode.final_distance_m:7.1f} mm  {episode.steps:4d} steps")
+
+    def on_trip(event: dict[str, Any]) -> None:
+        console.print(f"  [bold red]stop[/] {event['protection']} (category {event['stop_category']})", end=": ")
+        console.print(event["text"], markup=False)
+
+    def terminate(_signal: int, _frame: FrameType | None) -> None:
+        raise Terminated
+
+    status = Exit.DONE
+    outcome = Outcome()
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        with session, record_session(session, path, about, on_trip) as recording, actor:
+            try:
+                with stop_keys(lambda: session.link.desk.ask(Verb.ESTOP)):
+                    outcome = run_episodes(session, actor, task, episodes, seed, on_episode)
+                status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
+            except (KeyboardInterrupt, Terminated) as interruption:
+                kind = Verb.DISARM if isinstance(interruption, KeyboardInterrupt) else Verb.ESTOP
+                status = Exit.INTERRUPTED if isinstance(interruption, KeyboardInterrupt) else Exit.STOPPED_BY_SAFETY
+                outcome.stopped = "interrupted" if kind is Verb.DISARM else "emergency stop by SIGTERM"
+                console.print(f"  {outcome.stopped}: braking, then drives off")
+                session.bring_to_rest(kind)
+            state = session.state.name
+        result = report(session, outcome, about, recording.summary())
+        result["safety"]["state"] = state
+        result["processes"] = recording.processes | {"policy": actor.pid}
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    return status, result
+
+
+def _summarise(console: Console, result: dict[str, Any]) -> None:
+    reached = sum(episode["success"] for episode in result["episodes"])
+    timing, violations = result["timing"], result["safety"]["violations"]
+    console.print(f"{reached} of {len(result['episodes'])} reached; state {result['safety']['state']}", end="; ")
+    console.print(f"violations {sum(violations.values())}, clipped ticks {result['safety']['clipped_ticks']}")
+    if timing["tick_us"]:
+        late = timing["lateness_us"]["p99"]
+        console.print(f"{timing['servo_hz']:.0f} Hz servo, {timing['policy_hz']:.1f} Hz policy; ", end="")
+        console.print(f"tick p99 {timing['tick_us']['p99']:.0f} us, late p99 {late:.0f} us, {timing['overruns']} overruns")
+    if result["stopped"]:
+        console.print("[bold red]stopped[/]", end=" ")
+        console.print(result["stopped"], markup=False)
+    recording = result["recording"]
+    if recording:
+        console.print(f"recording {recording}", markup=False)

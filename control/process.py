@@ -1,0 +1,102 @@
+"""The control process: the loop in real time, alone, with nothing beside it that could make it late.
+
+It is started by `control.process_session` and shares memory with it. It imports nothing that draws, learns, logs to
+disk or serves a page. It ends when asked to, and stops the arm and ends by itself when its operator's process dies.
+"""
+
+import json
+import os
+import signal
+import sys
+from dataclasses import asdict, dataclass
+
+from robotctl.control import registry
+from robotctl.control.loop import Loop, Verb
+from robotctl.control.process_tools import go_real_time, name_process, signal_on_parent_death
+from robotctl.control.shared import Link
+from robotctl.hal.backend import open_backend
+from robotctl.hal.clock import MonotonicClock
+from robotctl.hal.errors import ConfigError, RobotctlError
+from robotctl.hal.robot import load_robot
+from robotctl.safety.machine import State
+
+_CLOSABLE = (State.READY, State.SILENT, State.FAULT)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessConfig:
+    """What a control process is told at its start."""
+
+    robot: str
+    overrides: list[str]
+    backend: str
+    channel: str
+    mailbox_fd: int
+    board_fd: int
+    slots: int
+    operator: int
+    """Pid of the operator's process."""
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+
+def main(text: str) -> int:
+    """Run one control process to its end and return its exit status."""
+    config = ProcessConfig(**json.loads(text))
+    name_process("robotctl-ctl")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the operator process's business
+    try:
+        robot = load_robot(config.robot, config.overrides)
+        link = Link.attach(config.mailbox_fd, config.board_fd, robot.dof, config.slots)
+        clock = MonotonicClock()
+        loop = Loop(robot, open_backend(config.backend, robot, clock, config.channel), clock, link)
+    except RobotctlError as error:
+        print(error, file=sys.stderr)  # noqa: T201 - the memory is not mapped yet; the operator reads this
+        return 2 if isinstance(error, ConfigError) else 4
+    signal.signal(signal.SIGUSR1, lambda *_: loop.estop("robotctl stop"))
+    signal.signal(signal.SIGTERM, lambda *_: loop.estop("SIGTERM"))
+    entry = registry.register(robot.profile.name, config.backend, config.channel, config.operator)
+    try:
+        return _run(loop, link, clock, config)
+    finally:
+        entry.unlink(missing_ok=True)
+
+
+def _run(loop: Loop, link: Link, clock: MonotonicClock, config: ProcessConfig) -> int:
+    try:
+        loop.bring_up()
+        missing = go_real_time()
+        text = f"real time without {' and '.join(missing)}" if missing else "real time: SCHED_FIFO, memory locked"
+        link.events.write({"type": "log", "stamp_ns": clock.now_ns(), "text": text})
+        signal_on_parent_death(signal.SIGTERM, config.operator)
+        _pace(loop, clock, config.operator)
+    except RobotctlError as error:
+        kind = "config" if isinstance(error, ConfigError) else "hardware"
+        link.events.write({"type": "error", "stamp_ns": clock.now_ns(), "kind": kind, "text": str(error)})
+        return 2 if kind == "config" else 4
+    finally:
+        statistics = loop.bus_statistics()
+        try:
+            loop.shut_down()
+        finally:
+            link.events.write({"type": "bus", "stamp_ns": clock.now_ns(), "statistics": statistics})
+    return 0
+
+
+def _pace(loop: Loop, clock: MonotonicClock, operator: int) -> None:
+    """Tick at absolute deadlines until the loop is closed. Missed deadlines are skipped, not caught up with."""
+    period = loop.robot.period_ns
+    deadline = clock.now_ns() + period
+    while not loop.closed:
+        clock.sleep_until(deadline)
+        loop.lateness_ns = clock.now_ns() - deadline
+        loop.tick()
+        if os.getppid() != operator and loop.supervisor.state in _CLOSABLE:
+            loop.request(Verb.CLOSE)  # nobody is left who could ask for it
+        behind = clock.now_ns() - deadline
+        deadline += period * max(1, 1 + behind // period)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

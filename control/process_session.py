@@ -1,0 +1,150 @@
+"""A session whose loop runs in real time, in a control process."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from robotctl.control import registry
+from robotctl.control.loop import Verb
+from robotctl.control.process import ProcessConfig
+from robotctl.control.session import Session, history_slots
+from robotctl.control.shared import Link
+from robotctl.hal.clock import MonotonicClock
+from robotctl.hal.errors import ConfigError, HardwareError
+from robotctl.hal.robot import Robot
+from robotctl.safety.machine import State
+
+_START_TIMEOUT_S = 30.0
+_CLOSE_TIMEOUT_S = 6.0
+
+
+class ProcessSession(Session):
+    """Starts, watches and ends one control process."""
+
+    def __init__(self, robot: Robot, backend: str, channel: str = "", overrides: Sequence[str] = ()) -> None:
+        super().__init__(robot, MonotonicClock(), Link.create(robot.dof, history_slots(robot)))
+        self._backend = backend
+        self._channel = channel
+        self._overrides = list(overrides)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._bus: dict[str, object] | None = None
+        self._error: dict[str, Any] | None = None
+        self._own_cursor = 0
+        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
+
+    @property
+    def pid(self) -> int | None:
+        """Pid of the control process."""
+        return self._process.pid if self._process else None
+
+    @property
+    def fds(self) -> tuple[int, int]:
+        """Descriptors of the mailbox and of the board, to be handed to neighbours."""
+        if self.link.fds is None:
+            raise HardwareError("the session's shared memory is closed")
+        return self.link.fds
+
+    def open(self) -> None:
+        mailbox, board = self.fds
+        config = ProcessConfig(
+            robot=str(self.robot.source),
+            overrides=self._overrides,
+            backend=self._backend,
+            channel=self._channel,
+            mailbox_fd=mailbox,
+            board_fd=board,
+            slots=self.link.ticks.slots,
+            operator=os.getpid(),
+        )
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "robotctl.control.process", config.to_json()],
+            pass_fds=(mailbox, board),
+            stdin=subprocess.DEVNULL,
+            stderr=self._complaints,
+            start_new_session=True,  # Ctrl-C in the terminal must not reach it
+        )
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        while self.link.ticks.latest() is None or self.state is not State.READY:
+            self._check()
+            if time.monotonic() > deadline:
+                raise HardwareError("the control process did not come up", "run robotctl doctor")
+            time.sleep(0.01)
+        self.poll()
+
+    def advance(self, seconds: float) -> None:
+        time.sleep(seconds)
+        self._check()
+        self.poll()
+
+    def close(self) -> None:
+        process = self._process
+        if process is not None and process.poll() is None:
+            self._bring_down(process)
+        if process is not None:
+            registry.unregister(process.pid)
+            self.poll()
+            self._collect()
+        self._complaints.close()
+        if self.link.fds is not None:
+            for fd in self.link.fds:
+                os.close(fd)
+            self.link.fds = None
+
+    def bus_statistics(self) -> dict[str, object] | None:
+        return self._bus
+
+    def poll(self) -> None:
+        super().poll()
+        self._collect()
+
+    def _collect(self) -> None:
+        events, self._own_cursor = self.link.events.since(self._own_cursor)
+        for event in events:
+            if event["type"] == "bus":
+                self._bus = event["statistics"]
+            elif event["type"] == "error":
+                self._error = event
+
+    def _bring_down(self, process: subprocess.Popen[bytes]) -> None:
+        record = self.link.ticks.latest()
+        if record is not None and State(int(record["state"])) not in (State.READY, State.FAULT, State.SILENT):
+            process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + _CLOSE_TIMEOUT_S
+        asked = False
+        while process.poll() is None and time.monotonic() < deadline:
+            record = self.link.ticks.latest()
+            settled = record is not None and State(int(record["state"])) in (State.READY, State.FAULT, State.SILENT)
+            if settled and not asked:
+                self.link.desk.ask(Verb.CLOSE)
+                asked = True
+            time.sleep(0.01)
+        if process.poll() is None:
+            process.kill()  # its drives have watchdogs
+            process.wait()
+
+    def _check(self) -> None:
+        """Raise if the control process is gone."""
+        if self._process is None:
+            raise HardwareError("the session is not open", "use it as a context manager")
+        status = self._process.poll()
+        if status is None:
+            return
+        self.poll()
+        if self._error is not None:
+            error = ConfigError if self._error["kind"] == "config" else HardwareError
+            raise error(self._error["text"])
+        self._complaints.seek(0)
+        complaint = self._complaints.read().decode(errors="replace").strip()
+        if status == 2:
+            raise ConfigError(complaint)
+        how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        detail = f"\n{complaint}" if complaint else ""
+        raise HardwareError(
+            f"the control process {how}; the drives go off by their own watchdogs{detail}",
+            "look at the arm, then start again",
+        )

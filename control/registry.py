@@ -1,0 +1,72 @@
+"""Which control processes run on this machine, so that `robotctl stop` finds them.
+
+One small JSON file per control process in the user's runtime folder, named after its pid. A file whose process is
+gone, or whose pid was given to another process since, is removed when met.
+"""
+
+import json
+import os
+import tempfile
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """One running control process."""
+
+    pid: int
+    started: int
+    """Start time of the process in clock ticks since boot: tells a process from a later one with the same pid."""
+    operator: int
+    """Pid of the process that started it."""
+    robot: str
+    backend: str
+    channel: str
+
+
+def folder() -> Path:
+    """Return the folder of the registry, which may not exist yet."""
+    base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
+    return Path(base) / f"robotctl-{os.getuid()}"
+
+
+def start_time(pid: int) -> int | None:
+    """Return a process's start time in clock ticks since boot, or None if it is gone or a zombie."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+def register(robot: str, backend: str, channel: str, operator: int) -> Path:
+    """Enter this process, and return its file, which the caller removes at its end."""
+    pid = os.getpid()
+    entry = Running(pid, start_time(pid) or 0, operator, robot, backend, channel)
+    folder().mkdir(mode=0o700, parents=True, exist_ok=True)
+    path = folder() / f"{pid}.json"
+    path.write_text(json.dumps(asdict(entry)))
+    return path
+
+
+def unregister(pid: int) -> None:
+    """Remove a process's file, if there is one."""
+    with suppress(FileNotFoundError):
+        (folder() / f"{pid}.json").unlink()
+
+
+def running() -> list[Running]:
+    """Return the control processes of this user that are alive."""
+    found = []
+    for path in sorted(folder().glob("*.json")):
+        try:
+            entry = Running(**json.loads(path.read_text()))
+        except (OSError, ValueError, TypeError):
+            continue  # being written, or just removed
+        if start_time(entry.pid) == entry.started:
+            found.append(entry)
+        else:
+            unregister(entry.pid)
+    return found

@@ -1,0 +1,231 @@
+"""A session: one arm with its loop, as its operator sees it. In lockstep here; in a process in `process_session`."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from robotctl.control.loop import Loop, Verb
+from robotctl.control.shared import Link
+from robotctl.control.statistics import TickStatistics
+from robotctl.hal.backend import open_backend
+from robotctl.hal.clock import Clock, VirtualClock
+from robotctl.hal.errors import HardwareError, RobotctlError
+from robotctl.hal.robot import Robot
+from robotctl.safety.judge import Judge
+from robotctl.safety.machine import State
+
+HISTORY_S = 60.0
+"""How much the ring of ticks remembers: the black box."""
+_ANSWER_TIMEOUT_S = 5.0
+_OFF = (State.OFF, State.SILENT, State.READY, State.FAULT)
+_STOPPED = (State.HOLD, State.FAULT, State.READY, State.SILENT)
+
+
+class Stopped(RobotctlError):
+    """The safety supervisor stopped the arm while something was expected of it."""
+
+
+def history_slots(robot: Robot) -> int:
+    """Return how many ticks a session of this robot remembers."""
+    return round(HISTORY_S * robot.profile.servo_hz)
+
+
+class Session(ABC):
+    """Operator's side of a loop: requests, states, events, statistics.
+
+    Life: `open` -> `prepare` -> (`begin` -> `advance`* -> `end`)* -> `finish`.
+    """
+
+    def __init__(self, robot: Robot, clock: Clock, link: Link) -> None:
+        self.robot = robot
+        self.clock = clock
+        self.link = link
+        self.judge = Judge(robot)
+        self.statistics = TickStatistics(robot.period_ns)
+        self.trips: list[dict[str, Any]] = []
+        self.on_event: Callable[[dict[str, Any]], None] | None = None
+        self.on_trip: Callable[[dict[str, Any]], None] | None = None
+        self._answers: dict[int, dict[str, Any]] = {}
+        self._tick_cursor = 0
+        self._event_cursor = 0
+
+    @abstractmethod
+    def open(self) -> None:
+        """Start the loop and bring it to READY.
+
+        Raises:
+            HardwareError: if the bus or a drive is not as it should be.
+        """
+
+    @abstractmethod
+    def advance(self, seconds: float) -> None:
+        """Let time pass.
+
+        Raises:
+            HardwareError: if the loop died.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release everything, whatever state it is in. Harmless when already closed."""
+
+    @abstractmethod
+    def bus_statistics(self) -> dict[str, object] | None:
+        """Return the bus counters of `Arm.bus_statistics`."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # -- looking --------------------------------------------------------------------------------------------------
+
+    def latest(self) -> np.void:
+        """Return the newest tick record.
+
+        Raises:
+            HardwareError: before the first tick.
+        """
+        record = self.link.ticks.latest()
+        if record is None:
+            raise HardwareError("the control loop has not made a tick yet")
+        return record
+
+    @property
+    def state(self) -> State:
+        return State(int(self.latest()["state"]))
+
+    def poll(self) -> None:
+        """Take in what happened since the last call: ticks into judge and statistics, trips and answers from events."""
+        records, self._tick_cursor, dropped = self.link.ticks.since(self._tick_cursor)
+        self.judge.take(records)
+        self.statistics.take(records, dropped)
+        events, self._event_cursor = self.link.events.since(self._event_cursor)
+        for event in events:
+            if event["type"] == "answer":
+                self._answers[event["number"]] = event
+            elif event["type"] == "trip":
+                self.trips.append(event)
+                if self.on_trip is not None:
+                    self.on_trip(event)
+            if self.on_event is not None:
+                self.on_event(event)
+
+    # -- asking ---------------------------------------------------------------------------------------------------
+
+    def request(self, verb: Verb) -> None:
+        """Ask the loop for something and wait for its answer.
+
+        Raises:
+            Stopped: if the present state does not allow it.
+            HardwareError: if the loop does not answer.
+        """
+        number = self.link.desk.ask(verb)
+        self._wait(lambda: number in self._answers, _ANSWER_TIMEOUT_S, f"the loop did not answer {verb.name}")
+        answer = self._answers.pop(number)
+        if not answer["ok"]:
+            raise Stopped(answer["text"])
+
+    def wait_for(self, *states: State, timeout_s: float) -> State:
+        """Return once the supervisor is in one of `states`.
+
+        Raises:
+            Stopped: if it comes to rest in another state, or not in time.
+        """
+        wanted = set(states) | set(_STOPPED)
+        names = " or ".join(state.name for state in states)
+        self._wait(lambda: self.state in wanted, timeout_s, f"state {names} not reached")
+        if self.state not in states:
+            cause = f": {self.trips[-1]['text']}" if self.trips else ""
+            raise Stopped(f"expected {names}, but the supervisor is in {self.state.name}{cause}")
+        return self.state
+
+    def reset(self, routine: Verb = Verb.HOME) -> None:
+        """Run a reset routine to its end.
+
+        Raises:
+            Stopped: if it is refused, or ends in anything but ARMED.
+        """
+        self.request(routine)
+        self.wait_for(State.ARMED, timeout_s=90.0)
+
+    def prepare(self) -> None:
+        """Arm, and go home."""
+        self.request(Verb.ARM)
+        self.reset()
+
+    def begin(self) -> None:
+        """Hand the arm to the policy."""
+        self.request(Verb.START)
+
+    def end(self) -> None:
+        """Take the arm back from the policy: brake, hold, ready for the next routine."""
+        self.request(Verb.STOP)
+        self.wait_for(State.HOLD, timeout_s=10.0)
+        self.request(Verb.ACK)
+
+    def finish(self) -> None:
+        """Park where the drives may go off, and switch them off."""
+        if self.state is State.ARMED:
+            self.reset(Verb.PARK)
+            self.request(Verb.DISARM)
+            self.wait_for(State.READY, timeout_s=10.0)
+        elif self.state is State.HOLD:
+            self.request(Verb.DISARM)
+            self._wait(lambda: self.state in (State.READY, State.FAULT), 10.0, "the drives did not go off")
+
+    def bring_to_rest(self, verb: Verb) -> None:
+        """Stop with DISARM or ESTOP and wait until the drives are off, whatever the present state."""
+        if self.state not in _OFF:
+            try:
+                self.request(verb)
+            except Stopped:
+                pass  # already stopping harder
+            self._wait(lambda: self.state in _OFF, 10.0, "the drives did not go off")
+
+    def _wait(self, condition: Callable[[], bool], timeout_s: float, complaint: str) -> None:
+        deadline = self.clock.now_ns() + round(timeout_s * 1e9)
+        self.poll()
+        while not condition():
+            if self.clock.now_ns() > deadline:
+                raise HardwareError(f"{complaint} within {timeout_s:g} s", "see the recording's log channel")
+            self.advance(0.01)
+
+
+class LockstepSession(Session):
+    """The loop in this process on a virtual clock: as fast as the machine allows, the same every time."""
+
+    def __init__(self, robot: Robot, backend: str, channel: str = "") -> None:
+        clock = VirtualClock()
+        super().__init__(robot, clock, Link.local(robot.dof, history_slots(robot)))
+        self._rig = open_backend(backend, robot, clock, channel)
+        self.loop = Loop(robot, self._rig, clock, self.link)
+        self._next_ns = 0
+
+    def open(self) -> None:
+        self.loop.bring_up()
+        self.loop.tick()
+        self._next_ns = self.clock.now_ns() + self.robot.period_ns
+
+    def advance(self, seconds: float) -> None:
+        for _ in range(max(1, round(seconds * self.robot.profile.servo_hz))):
+            self.clock.sleep_until(self._next_ns)
+            self._next_ns += self.robot.period_ns
+            if not self.loop.closed:
+                self.loop.tick()
+        self.poll()
+
+    def close(self) -> None:
+        if not self.loop.closed:
+            self.poll()
+            self.loop.shut_down()
+
+    def bus_statistics(self) -> dict[str, object] | None:
+        return self._rig.arm.bus_statistics()

@@ -1,0 +1,56 @@
+"""What a run's ticks add up to: rates, overruns, percentiles, clipped ticks."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def percentiles_us(nanoseconds: NDArray[Any]) -> dict[str, float] | None:
+    """Return p50, p99, p999 and max in microseconds; None without data."""
+    if not len(nanoseconds):
+        return None
+    p50, p99, p999 = (float(value) / 1e3 for value in np.percentile(nanoseconds, (50, 99, 99.9)))
+    return {"p50": round(p50, 1), "p99": round(p99, 1), "p999": round(p999, 1), "max": round(nanoseconds.max() / 1e3, 1)}
+
+
+class TickStatistics:
+    """Takes tick records in any portions."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._durations: list[NDArray[Any]] = []
+        self._lateness: list[NDArray[Any]] = []
+        self.ticks = 0
+        self.clipped = 0
+        self.overruns = 0
+        self.dropped = 0
+        """Records that were overwritten before this side read them."""
+        self._first_ns: int | None = None
+        self._last_ns = 0
+
+    def take(self, records: NDArray[Any], dropped: int = 0) -> None:
+        self.dropped += dropped
+        self.ticks += dropped
+        if not len(records):
+            return
+        self._durations.append(records["duration_ns"].copy())
+        self._lateness.append(records["lateness_ns"].copy())
+        self.ticks += len(records)
+        self.clipped += int((records["clip"] != 0).sum())
+        self.overruns += int((records["lateness_ns"] > self._period_ns).sum())
+        if self._first_ns is None:
+            self._first_ns = int(records["stamp_ns"][0])
+        self._last_ns = int(records["stamp_ns"][-1])
+
+    def report(self) -> dict[str, object]:
+        """Return the numbers of the report's `timing` section."""
+        elapsed = self._last_ns - (self._first_ns or 0)
+        none = np.empty(0)
+        return {
+            "ticks": self.ticks,
+            "servo_hz": round((self.ticks - 1) / elapsed * 1e9, 2) if elapsed > 0 else 0.0,
+            "overruns": self.overruns,
+            "tick_us": percentiles_us(np.concatenate(self._durations) if self._durations else none),
+            "lateness_us": percentiles_us(np.concatenate(self._lateness) if self._lateness else none),
+        }

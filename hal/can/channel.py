@@ -1,0 +1,136 @@
+"""Where the drives are: a channel's name, opened as a python-can bus.
+
+`emulated` and whatever else other packages add come from the entry point group `robotctl.channels`, so that the HAL
+imports no simulation. Nothing is sent by opening.
+"""
+
+import errno
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any
+
+import can
+
+from robotctl.hal.clock import Clock
+from robotctl.hal.errors import BusError, ConfigError
+from robotctl.hal.profile import CanBus
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Truth
+
+FORMS = "emulated, virtual:NAME, socketcan:INTERFACE, slcan:DEVICE, or INTERFACE:CHANNEL for any other of python-can's"
+
+SLCAN_SETTLE_S = 0.1
+"""Wait after a serial port was opened. python-can waits 2 s, for adapters that reboot when opened; USB ones do not."""
+
+# python-can logs what it raises as well, and without a handler of ours that would reach the terminal.
+logging.getLogger("can").addHandler(logging.NullHandler())
+
+
+@dataclass(frozen=True)
+class Channel:
+    """An open bus, and what is known of it."""
+
+    bus: can.BusABC
+    fd: bool
+    """Whether CAN FD frames pass."""
+    truth: Callable[[], Truth] | None = None
+    """The true state of the plant behind it, where that is known."""
+    simulated: bool = False
+    """Whether its time is the clock's that it was opened with, and nothing arrives unless that clock moves."""
+
+
+ChannelFactory = Callable[[Robot, Clock], Channel]
+"""What an entry point of the group `robotctl.channels` must be."""
+
+
+_OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError, NameError)
+"""NameError is what some of python-can's interfaces end in where the vendor's library is missing."""
+
+
+def open_channel(name: str, robot: Robot, clock: Clock) -> Channel:
+    """Open a channel by name.
+
+    Raises:
+        ConfigError: if the name has no known form, or the robot has no CAN drives.
+        BusError: if it cannot be opened.
+    """
+    wiring = robot.profile.can
+    if wiring is None:
+        raise ConfigError(
+            f"robot {robot.profile.name!r} has no CAN drives", "use --backend sim, or a robot with drives"
+        )
+    interface, _, where = name.partition(":")
+    factories = {entry.name: entry for entry in entry_points(group="robotctl.channels")}
+    if interface in factories:
+        if where:
+            raise ConfigError(f"channel {interface!r} takes no {where!r}", f"use {interface}")
+        factory: ChannelFactory = factories[interface].load()
+        return factory(robot, clock)
+    if not interface or not where:
+        raise ConfigError(f"unknown channel {name!r}", f"use {FORMS}")
+    if interface not in can.VALID_INTERFACES:
+        raise ConfigError(
+            f"unknown channel {name!r}: python-can has no interface {interface!r}",
+            f"use {FORMS}: {', '.join(sorted(can.VALID_INTERFACES))}",
+        )
+    bus = open_bus(interface, where, _options(interface, wiring))
+    fd = wiring.fd if interface == "virtual" else bus.protocol is not can.CanProtocol.CAN_20
+    return Channel(bus, fd and wiring.fd)
+
+
+def open_bus(interface: str, where: str, options: Mapping[str, Any]) -> can.BusABC:
+    """Open a python-can bus, ignoring python-can's own configuration files.
+
+    Raises:
+        BusError: with what can be done about it.
+    """
+    try:
+        return can.Bus(channel=where, interface=interface, ignore_config=True, **options)
+    except _OPEN_ERRORS as error:
+        raise BusError(f"cannot open {interface}:{where}: {error}", _remedy(interface, where, error)) from error
+
+
+def _options(interface: str, wiring: CanBus) -> dict[str, Any]:
+    match interface:
+        case "virtual":
+            return {"protocol": can.CanProtocol.CAN_FD if wiring.fd else can.CanProtocol.CAN_20}
+        case "socketcan" | "udp_multicast":
+            return {"fd": wiring.fd}
+        case "slcan":
+            return {"bitrate": wiring.bitrate, "sleep_after_open": SLCAN_SETTLE_S}
+        case _:
+            return {"bitrate": wiring.bitrate}
+
+
+def _remedy(interface: str, where: str, error: Exception) -> str:
+    number = _errno(error)
+    if interface == "socketcan":
+        if number == errno.EAFNOSUPPORT:
+            return "this kernel has no CAN; load it with `modprobe can-raw`, or use an slcan adapter: slcan:DEVICE"
+        if number in (errno.EPERM, errno.EACCES):
+            return "opening a CAN socket was forbidden; run outside the sandbox, or allow raw CAN sockets"
+        return (
+            f"look for the interface with `ip link show type can`; bring it up with `ip link set {where} up type can "
+            f"bitrate 1000000 dbitrate 5000000 fd on`, or for a virtual one `ip link add {where} type vcan`"
+        )
+    if number in (errno.EACCES, errno.EPERM):
+        return f"no permission for {where}; add yourself to the group that owns it (`ls -l {where}`), often dialout"
+    if number == errno.EBUSY:
+        return f"{where} is in use by another program; close that first"
+    if interface == "slcan":
+        return f"is the adapter plugged in? `ls {where} /dev/ttyACM* /dev/ttyUSB*` shows serial devices"
+    if isinstance(error, ImportError | NameError | can.CanInterfaceNotImplementedError):
+        return f"install the driver package that python-can needs for {interface!r}"
+    return f"check that {where!r} is a channel of python-can's interface {interface!r}"
+
+
+def _errno(error: BaseException | None) -> int | None:
+    # python-can and pyserial wrap the system's error, each in its own way.
+    while error is not None:
+        number = getattr(error, "errno", None) or getattr(error, "error_code", None)
+        if isinstance(number, int):
+            return number
+        error = error.__cause__ or error.__context__
+    return None

@@ -1,0 +1,473 @@
+"""An arm of DAMIAO drives in MIT mode, with the gripper on the same bus.
+
+What matters is what a drive was told last, so every way into motion ends at the measured pose, and every way out is
+confirmed by the drives. A cycle is one frame per joint and one reply each: the reply to the command of this tick is
+the sample of the next one, stamped with the time it arrived.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from robotctl.hal.arm import Arm
+from robotctl.hal.can.channel import Channel, open_channel
+from robotctl.hal.can.damiao.codec import KD_MAX, KP_MAX, Special, Status
+from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, DrivesError, Identity
+from robotctl.hal.can.damiao.faults import fault_of, is_fault, status_name
+from robotctl.hal.can.damiao.gripper import DamiaoGripper
+from robotctl.hal.can.damiao.motors import MOTORS
+from robotctl.hal.can.damiao.registers import ControlMode
+from robotctl.hal.can.damiao.verification import Eavesdropper, Expected, plausible_turns, verify_drive
+from robotctl.hal.can.transport import Transport, route_key
+from robotctl.hal.clock import Clock
+from robotctl.hal.errors import ConfigError, DriveError, HardwareError
+from robotctl.hal.profile import CanBus
+from robotctl.hal.profile import Drive as DriveProfile
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Truth, Vector, frozen
+
+DISABLE_TRIES = 10
+"""Disable frames before a drive counts as one that cannot be switched off (axol uses 10)."""
+
+_POLL_PERIOD_NS = 3_500_000
+"""Between two requests for feedback while the drives are off; every second tick at 500 Hz, 40 % load on FD."""
+
+_LEAST_DAMPING = 0.5
+"""Nms/rad of the motor in DAMP, where a profile's kd is smaller: damping has to stop an arm without brakes."""
+
+_BUS_OFF = Fault(
+    "bus", 0x40, "BUS_OFF", "the controller left the bus after too many errors; check cable and termination"
+)
+
+Inspector = Callable[[Sequence[tuple[int, bytes]]], str]
+"""Sees the encoded frames (id, data) of a cycle before they leave. Any text it returns keeps them all back."""
+
+
+class DamiaoArm(Arm):
+    """Fulfils `Arm` on a CAN channel, which is opened by `connect` and not before.
+
+    `warnings` holds what bring-up put right, `identities` what the drives said of themselves, by joint.
+    `inspector`, where set, has the last word on every cycle of motion frames.
+    """
+
+    def __init__(self, robot: Robot, clock: Clock, channel: str) -> None:
+        """Prepare. Opens and sends nothing.
+
+        Raises:
+            ConfigError: if the profile has no CAN drives, or asks for what the wire cannot carry.
+        """
+        profile = robot.profile
+        if profile.can is None:
+            raise ConfigError(
+                f"{robot.source}: the robot has no `can` section", "use --backend sim, or describe its drives"
+            )
+        self.warnings: list[str] = []
+        self.identities: dict[str, Identity] = {}
+        self.inspector: Inspector | None = None
+        self.gripper: DamiaoGripper | None = None
+        self._robot = robot
+        self._clock = clock
+        self._name = channel
+        self._can: CanBus = profile.can
+        self._specs = [(joint.name, joint.drive) for joint in profile.joints if joint.drive is not None]
+        self._expected = [self._expect(joint.name, joint.drive) for joint in profile.joints if joint.drive is not None]
+        if profile.gripper and profile.gripper.drive:
+            self.gripper = DamiaoGripper(profile.gripper, clock)
+            drive = profile.gripper.drive
+            # The gripper's angle is mapped by motor_open, so its drive stays in the motor's own radians.
+            self._specs.append(("gripper", drive.model_copy(update={"sign": 1, "gear": 1.0, "offset": 0.0})))
+            self._expected.append(
+                Expected(drive.motor, ControlMode.POS_FORCE, profile.safety.drive_timeout_s, None, 2.0 * np.pi)
+            )
+        _check(robot, self._specs)
+        self._channel: Channel | None = None
+        self._transport: Transport | None = None
+        self._drives: list[Drive] = []
+        self._joints: list[Drive] = []
+        self._zeros = frozen([0.0] * robot.dof)
+        self._still = [0.0] * robot.dof
+        self._feed_forward = self._zeros
+        self._gains: dict[CommandMode, list[int]] = {}
+        self._verified = False
+        self._enabled = False
+        self._polled_ns = 0
+
+    # --- life -------------------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        if self._open:
+            return
+        channel = open_channel(self._name, self._robot, self._clock)
+        transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
+        self._channel, self._transport = channel, transport
+        self._verified = self._enabled = False
+        self._drives = [
+            Drive(
+                name,
+                spec.id,
+                spec.reply_id,
+                MOTORS[spec.motor],
+                transport,
+                self._clock,
+                spec.sign * spec.gear,
+                spec.offset,
+            )
+            for name, spec in self._specs
+        ]
+        self._joints = self._drives[: self._robot.dof]
+        gains = [joint.gains for joint in self._robot.profile.joints]
+        pairs = list(zip(self._joints, gains, strict=True))
+        self._gains = {
+            CommandMode.TRACK: [drive.gains(gain.kp, gain.kd) for drive, gain in pairs],
+            CommandMode.EFFORT: [drive.gains(0.0, 0.0) for drive in self._joints],
+            CommandMode.DAMP: [
+                drive.gains(0.0, max(gain.kd, _LEAST_DAMPING * drive.scale**2)) for drive, gain in pairs
+            ],
+        }
+        if self.gripper:
+            self.gripper.attach(self._drives[-1], transport)
+
+    def verify(self) -> None:
+        """Read back from every drive what it is, and refuse what the profile does not say. Enables nothing.
+
+        Raises:
+            DriveError: if one drive is not as it should be.
+            DrivesError: if several are, or one in several ways; it holds them all.
+            BusError: if the bus is gone.
+        """
+        transport = self._require_open()
+        self._verified = False
+        self.warnings.clear()
+        self.identities.clear()
+        others = Eavesdropper()
+        transport.listener = others
+        problems: list[DriveError] = []
+        try:
+            for drive, expected in zip(self._drives, self._expected, strict=True):
+                identity, found = verify_drive(drive, expected, others, self.warnings)
+                problems += found
+                if identity is not None:
+                    self.identities[drive.name] = identity
+                if drive.status == Status.ENABLED:
+                    self.warnings.append(f"{drive.name}: was already enabled")
+        finally:
+            transport.listener = None
+        _raise(problems)
+        self._verified = True
+
+    def enable(self) -> None:
+        """Enable every drive that is not, each holding the pose measured at that moment.
+
+        Raises:
+            HardwareError: if the arm is not verified, or a drive is silent, faulty, elsewhere than when it was
+                verified, or does not enable. All drives are then disabled again.
+            BusError: if the bus is gone.
+        """
+        transport = self._require_open()
+        if not self._verified:
+            raise HardwareError("the drives are not verified", "call verify() first")
+        _raise(self._not_ready())
+        if self._enabled and all(drive.status == Status.ENABLED for drive in self._drives):
+            return
+        try:
+            self._enable_all(transport)
+        except HardwareError:
+            self.disable()
+            raise
+        self._enabled = True
+
+    def read(self) -> Sample:
+        """Return the latest sample; angles are NaN, with stamp 0, until a joint is first heard of.
+
+        While the drives are verified and off it asks them for feedback.
+        """
+        transport = self._require_open()
+        transport.drain()
+        now = self._clock.now_ns()
+        if self._verified and not self._enabled and now - self._polled_ns >= _POLL_PERIOD_NS:
+            self._poll(transport, now)
+        joints = self._joints
+        enabled = True
+        faults: tuple[Fault, ...] = ()
+        for drive in joints:
+            if drive.status != 1:
+                enabled = False
+        for drive in self._drives:
+            if drive.status > 1:
+                faults += (fault_of(drive.name, drive.status),)
+        if transport.state == "bus-off":
+            faults += (_BUS_OFF,)
+        return Sample(
+            now,
+            np.array([drive.position for drive in joints]),
+            np.array([drive.velocity for drive in joints]),
+            np.array([drive.effort for drive in joints]),
+            np.array([drive.stamp_ns for drive in joints], dtype=np.int64),
+            faults,
+            enabled,
+        )
+
+    def write(self, command: Command) -> Sent:
+        """Send one MIT frame per joint. Says in the result what was clipped by the wire's range or kept back.
+
+        While the drives are off nothing is sent, but the effort is remembered: `enable` holds with it.
+        """
+        transport = self._require_open()
+        self._feed_forward = command.effort
+        if not self._enabled:
+            return Sent(command, "drives are off")
+        joints = self._joints
+        mode, position, velocity, effort = command
+        try:
+            if mode == CommandMode.TRACK:
+                targets, speeds = position.tolist(), velocity.tolist()
+            else:
+                # kp is 0, so the angle has no effect; the measured one is what a reader of the log expects.
+                targets, speeds = [drive.position for drive in joints], self._still
+            frames = [
+                (drive.id, drive.encode(q, dq, torque, gains))
+                for drive, q, dq, torque, gains in zip(
+                    joints, targets, speeds, effort.tolist(), self._gains[mode], strict=True
+                )
+            ]
+        except (ValueError, OverflowError):
+            return Sent(command, "not sent: a value is not finite, or there are not as many as joints")
+        if self.inspector is not None:
+            refusal = self.inspector(frames)
+            if refusal:
+                return Sent(command, f"not sent: {refusal}")
+        now = self._clock.now_ns()
+        for drive in joints:
+            if drive.reply_pending:
+                drive.missed += 1
+            drive.reply_pending = True
+            drive.sent_ns = now
+        count = transport.send_all(frames)
+        if transport.simulated:
+            # The replies are there already: stamp them now, not one tick later.
+            transport.drain()
+        if count < len(frames):
+            for drive in joints[count:]:
+                drive.reply_pending = False
+            return Sent(command, f"{len(frames) - count} frames were not sent: the transmit queue is full")
+        for drive in joints:
+            if drive.saturated or drive.status != 1:
+                return self._altered(command, frames)
+        return Sent(command)
+
+    def hold(self) -> Sent:
+        """Ask the drives to hold the measured pose, with the effort of the latest command as feed-forward.
+
+        Raises:
+            BusError: if the bus is gone.
+        """
+        position = np.array([drive.position for drive in self._joints])
+        return self.write(Command(CommandMode.TRACK, position, self._zeros, self._feed_forward))
+
+    def disable(self) -> None:
+        """Take the torque away from every drive, the gripper's too. Resent up to ten times until confirmed.
+
+        Raises:
+            DriveError: if one drive never confirms; DrivesError if several do not.
+            BusError: if the bus is gone.
+        """
+        self._enabled = False
+        self._feed_forward = self._zeros
+        if self.gripper:
+            self.gripper.release()
+        if not self._open:
+            return
+        transport = self._require_open()
+        waiting = self._drives
+        for _ in range(DISABLE_TRIES):
+            marks = [(drive, drive.heard) for drive in waiting]
+            for drive in waiting:
+                drive.special(Special.DISABLE)
+            transport.wait(lambda marks=marks: not _unconfirmed(marks), CONFIRM_TIMEOUT_S)  # type: ignore[misc]
+            waiting = _unconfirmed(marks)
+            if not waiting:
+                return
+        self._verified = False
+        remedy = "cut the power of the drives; without frames their watchdogs should have acted"
+        _raise([drive.error(f"did not confirm {DISABLE_TRIES} disable frames", remedy) for drive in waiting])
+
+    def clear_faults(self) -> None:
+        """Clear the fault of every drive that reports one. Enables nothing.
+
+        Raises:
+            DriveError: if one drive is silent or keeps its fault; DrivesError if several do.
+            BusError: if the bus is gone.
+        """
+        self._require_open()
+        problems = []
+        for drive in self._drives:
+            try:
+                drive.refresh()
+                if is_fault(drive.status):
+                    drive.answers(Special.CLEAR_ERROR)
+                    drive.refresh()
+            except DriveError as silent:
+                problems.append(silent)
+                continue
+            if is_fault(drive.status):
+                fault = fault_of(drive.name, drive.status)
+                problems.append(drive.error(f"keeps its fault {fault.name}", fault.hint))
+        _raise(problems)
+
+    def close(self) -> None:
+        self._verified = self._enabled = False
+        if self.gripper:
+            self.gripper.release()
+        if self._transport is not None:
+            self._transport.close()
+        self._channel = None
+
+    # --- about ------------------------------------------------------------------------------------------------------
+
+    def truth(self) -> Truth | None:
+        channel = self._channel
+        return channel.truth() if channel is not None and channel.truth is not None else None
+
+    def bus_statistics(self) -> dict[str, object] | None:
+        """Return the counters since `connect`; they outlive `close`. `missed_by_joint` counts per drive."""
+        if self._transport is None:
+            return None
+        missed = {drive.name: drive.missed for drive in self._drives}
+        return {**self._transport.statistics(), "missed_replies": sum(missed.values()), "missed_by_joint": missed}
+
+    # --- parts ------------------------------------------------------------------------------------------------------
+
+    @property
+    def _open(self) -> bool:
+        return self._channel is not None
+
+    def _require_open(self) -> Transport:
+        if self._channel is None or self._transport is None:
+            raise HardwareError("the arm is not connected", "call connect() first")
+        return self._transport
+
+    def _expect(self, joint: str, drive: DriveProfile) -> Expected:
+        model = self._robot.description.limits[joint]
+        turn = 2.0 * np.pi / drive.gear
+        timeout = self._robot.profile.safety.drive_timeout_s
+        return Expected(drive.motor, ControlMode.MIT, timeout, (model.lower, model.upper), turn)
+
+    def _poll(self, transport: Transport, now: int) -> None:
+        self._polled_ns = now
+        for drive in self._drives:
+            drive.expect_reply(now)
+            drive.reply_pending = drive.poll()
+        if transport.simulated:
+            transport.drain()
+
+    def _not_ready(self) -> list[DriveError]:
+        """Ask every drive how it is, and return what forbids enabling."""
+        problems = []
+        for drive, expected in zip(self._drives, self._expected, strict=True):
+            try:
+                drive.refresh()
+            except DriveError as silent:
+                problems.append(silent)
+                continue
+            if is_fault(drive.status):
+                fault = fault_of(drive.name, drive.status)
+                problems.append(drive.error(f"reports {fault.name}", f"{fault.hint}; then clear the fault"))
+            if expected.bounds and 0 not in plausible_turns(drive.position, expected.bounds, expected.turn):
+                problems.append(
+                    drive.error(
+                        f"measures {drive.position:.4f} rad, outside its joint's range",
+                        "verify the drives again: one that lost its power may have woken up a turn off",
+                    )
+                )
+        return problems
+
+    def _enable_all(self, transport: Transport) -> None:
+        holding: list[tuple[Drive, bytes]] = []
+        for drive in self._drives:
+            # The watchdogs of those that hold already run while this one is waited for.
+            for _ in range(TRIES):
+                if drive.answers(Special.ENABLE) and drive.status == Status.ENABLED:
+                    break
+                transport.send_all([(held.id, frame) for held, frame in holding])
+            else:
+                name = status_name(drive.status)
+                raise drive.error(f"did not enable in {TRIES} tries, its status is {name}", "check its supply")
+            if len(holding) < len(self._joints):
+                index = len(holding)
+                effort = float(self._feed_forward[index])
+                frame = drive.encode(drive.position, 0.0, effort, self._gains[CommandMode.TRACK][index])
+                holding.append((drive, frame))
+                transport.send_all([(drive.id, frame)])
+            elif self.gripper:
+                self.gripper.engage()
+        marks = [(drive, drive.heard) for drive, _ in holding]
+        transport.send_all([(drive.id, frame) for drive, frame in holding])
+        transport.wait(lambda: all(drive.heard > mark for drive, mark in marks), CONFIRM_TIMEOUT_S)
+        _raise(
+            [
+                drive.error(f"did not stay enabled, its status is {status_name(drive.status)}", "check its supply")
+                for drive in self._drives
+                if drive.status != Status.ENABLED
+            ]
+        )
+
+    def _altered(self, command: Command, frames: Sequence[tuple[int, bytes]]) -> Sent:
+        """Return what a cycle really asked for, and why that is not the command."""
+        reasons = []
+        clipped = [drive for drive in self._joints if drive.saturated]
+        if clipped:
+            reasons.append(f"clipped to the wire's range: {', '.join(drive.name for drive in clipped)}")
+            asked = (command.position.copy(), command.velocity.copy(), command.effort.copy())
+            for index, drive in enumerate(self._joints):
+                if drive.saturated:
+                    drive.saturated = False
+                    for array, value in zip(asked, drive.decode(frames[index][1]), strict=True):
+                        array[index] = value
+            command = Command(command.mode, *(_locked(array) for array in asked))
+        off = [
+            f"{drive.name} ({status_name(drive.status)})" for drive in self._joints if drive.status != Status.ENABLED
+        ]
+        if off:
+            reasons.append(f"drives are off: {', '.join(off)}")
+        return Sent(command, "; ".join(reasons))
+
+
+def _locked(array: Vector) -> Vector:
+    array.flags.writeable = False
+    return array
+
+
+def _unconfirmed(marks: Sequence[tuple[Drive, int]]) -> list[Drive]:
+    return [drive for drive, mark in marks if drive.heard == mark or drive.status == Status.ENABLED]
+
+
+def _raise(problems: Sequence[DriveError]) -> None:
+    if len(problems) == 1:
+        raise problems[0]
+    if problems:
+        raise DrivesError(problems)
+
+
+def _check(robot: Robot, specs: Sequence[tuple[str, DriveProfile]]) -> None:
+    """Refuse what the wire cannot carry.
+
+    Raises:
+        ConfigError: naming every joint concerned.
+    """
+    problems = []
+    seen: dict[int, str] = {}
+    for name, spec in specs:
+        if spec.motor not in MOTORS:
+            problems.append(f"{name}: unknown motor {spec.motor!r}; known are {', '.join(MOTORS)}")
+        key = route_key(spec.reply_id, spec.id)
+        if key in seen:
+            problems.append(f"{name}: replies on 0x{spec.reply_id:02X} cannot be told from those of {seen[key]}")
+        seen.setdefault(key, name)
+    for joint in robot.profile.joints:
+        square = joint.drive.gear**2 if joint.drive else 1.0
+        if joint.gains.kp / square > KP_MAX or joint.gains.kd / square > KD_MAX:
+            problems.append(
+                f"{joint.name}: the drive takes kp up to {KP_MAX * square:g} and kd up to {KD_MAX * square:g}"
+            )
+    if problems:
+        raise ConfigError("\n".join(f"{robot.source}: {problem}" for problem in problems), "correct the profile")

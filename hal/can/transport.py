@@ -1,0 +1,338 @@
+"""The one place that sends and receives CAN frames: bounded sends, a receive path of our own, and counters.
+
+There is no receive thread and no `can.Notifier` (whose thread dies at the first exception). The control loop reads in
+every tick, which is more often than a socket buffer can fill, so `drain` takes whatever has arrived without waiting.
+A thread would add nothing but contention for the interpreter: a frame that came between two ticks is of no use before
+the next one. What a thread could do better, the time of arrival, the kernel's receive stamp does better still.
+
+A full transmit queue has two causes with opposite answers: a short stall of the adapter, where the frame is dropped
+and the next one goes out, and a bus on which nobody acknowledges, where motion frames would pile up and be replayed
+when power returns. So a full queue is counted, the rest of the cycle is not even tried, and when it lasts for
+`FAILING_LIMIT_NS` the bus is given up.
+"""
+
+import errno
+import select
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import can
+
+from robotctl.hal.can.channel import Channel
+from robotctl.hal.clock import Clock
+from robotctl.hal.errors import BusError
+
+SEND_TIMEOUT_S = 0.001
+"""Longest wait for room in the transmit queue. Not 0, since pyserial then truncates frames without a word."""
+
+FAILING_LIMIT_NS = 200_000_000
+"""A bus on which every send has failed for this long is given up."""
+
+DRAIN_LIMIT = 512
+"""Frames taken in one call, so that a babbling node cannot hold the loop."""
+
+POLL_NS = 500_000
+"""Step of `wait`."""
+
+_LOST = frozenset({errno.ENODEV, errno.ENXIO, errno.ENETDOWN, errno.ENETUNREACH, errno.EBADF, errno.EIO})
+_FULL = frozenset({errno.ENOBUFS, errno.EAGAIN})
+_READ_ERRORS = (can.CanError, OSError, ValueError, IndexError, struct.error)
+"""What python-can's readers raise; the last three for garbage on a serial line."""
+_READ_RETRIES = 8
+_OLDEST_STAMP_S = 0.1
+_LOAD_WINDOW_NS = 500_000_000
+
+# Error classes of SocketCAN (linux/can/error.h), as they stand in the id of an error frame.
+_ERROR_CONTROLLER = 0x004
+_ERROR_BUS_OFF = 0x040
+_ERROR_RESTARTED = 0x100
+_CONTROLLER_PASSIVE = 0x30
+_CONTROLLER_ACTIVE = 0x40
+
+Route = Callable[[bytearray, int], bool]
+"""Takes the 8 data bytes and the receive stamp in ns; returns whether the frame was understood."""
+
+Listener = Callable[[int, bytes], None]
+"""Takes the id and the data of a frame that no route understood."""
+
+
+class RoundTrip(NamedTuple):
+    """Times from a request to its reply, in microseconds, of the latest 4096 replies."""
+
+    p50: float
+    p99: float
+    max: float
+
+
+class Transport:
+    """An open channel, with routes for what arrives and counters for what happens.
+
+    `routes` is keyed by `route_key`. All counters count from the opening.
+
+    Raises:
+        BusError: from every method but `close` and `statistics`, once the interface is gone.
+    """
+
+    def __init__(self, channel: Channel, clock: Clock, bitrate: int = 1_000_000, data_bitrate: int = 5_000_000) -> None:
+        self.fd = channel.fd
+        self.simulated = channel.simulated
+        self.routes: dict[int, Route] = {}
+        self.listener: Listener | None = None
+        self.sent = 0
+        self.received = 0
+        self.error_frames = 0
+        self.unexpected = 0
+        self.send_failures = 0
+        self.state = "active"
+        """What the error frames say of the controller: active, passive or bus-off."""
+        self.trips: deque[int] = deque(maxlen=4096)
+        """Round trips in ns; drives append to it."""
+        self._bus = channel.bus
+        self._recv = channel.bus.recv
+        self._send = channel.bus.send
+        self._clock = clock
+        self._poll = _poll_of(channel.bus)
+        self._lost = ""
+        self._closed = False
+        self._failing_since: int | None = None
+        self._frame_ns = frame_time_ns(channel.fd, bitrate, data_bitrate)
+        self._load = 0.0
+        self._load_from = clock.now_ns()
+        self._load_frames = 0
+
+    # --- out --------------------------------------------------------------------------------------------------------
+
+    def send(self, arbitration_id: int, data: bytes, fd: bool = False, force: bool = False) -> bool:
+        """Send one frame and return whether it left the host. Classic unless `fd`; never waits beyond SEND_TIMEOUT_S.
+
+        While the controller is bus-off nothing is tried, except with `force`: for frames that take torque away.
+        """
+        if self._lost:
+            raise self._gone()
+        if self.state == "bus-off" and not force:
+            self.send_failures += 1
+            return False
+        try:
+            self._send(
+                can.Message(0.0, arbitration_id, False, False, False, None, None, data, fd, False, fd), SEND_TIMEOUT_S
+            )
+        except (can.CanError, OSError) as error:
+            self._send_failed(error)
+            return False
+        self.sent += 1
+        self._failing_since = None
+        return True
+
+    def send_all(self, frames: Iterable[tuple[int, bytes]]) -> int:
+        """Send the frames of one cycle, FD where the channel is, and return how many left the host.
+
+        After the first failure the others are not tried: with a full queue each would cost SEND_TIMEOUT_S.
+        """
+        if self._lost:
+            raise self._gone()
+        if self.state == "bus-off":
+            self.send_failures += 1
+            return 0
+        count = 0
+        send, fd, message = self._send, self.fd, can.Message
+        try:
+            for arbitration_id, data in frames:
+                send(message(0.0, arbitration_id, False, False, False, None, 8, data, fd, False, fd), SEND_TIMEOUT_S)
+                count += 1
+        except (can.CanError, OSError) as error:
+            self._send_failed(error)
+        self.sent += count
+        if count:
+            self._failing_since = None
+        return count
+
+    # --- in ---------------------------------------------------------------------------------------------------------
+
+    def drain(self) -> None:
+        """Take what has arrived and hand it to the routes, without waiting. Garbage is counted, never fatal."""
+        if self._lost:
+            raise self._gone()
+        now = self._clock.now_ns()
+        recv, routes, simulated = self._recv, self.routes, self.simulated
+        wall = 0.0 if simulated else time.time()
+        failures = 0
+        for _ in range(DRAIN_LIMIT):
+            try:
+                message = recv(0.0)
+            except _READ_ERRORS as error:
+                self._receive_failed(error)
+                failures += 1
+                if failures == _READ_RETRIES:
+                    break
+                continue
+            if message is None:
+                # An slcan adapter's acknowledgements read as None although frames wait behind them.
+                if self._poll is None or not self._poll.poll(0):
+                    break
+                continue
+            if message.is_error_frame:
+                self._on_error_frame(message.arbitration_id, message.data)
+                continue
+            self.received += 1
+            data = message.data
+            if len(data) == 8 and not message.is_extended_id and not message.is_remote_frame:
+                route = routes.get(message.arbitration_id << 4 | data[0] & 0xF)
+                if route is not None and route(data, now if simulated else _stamp(now, wall, message.timestamp)):
+                    continue
+            self.unexpected += 1
+            if self.listener is not None:
+                self.listener(message.arbitration_id, bytes(data))
+        self._measure_load(now)
+
+    def wait(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Drain until `done()` or until the time is up, and return whether it is done. Not for the control loop."""
+        deadline = self._clock.now_ns() + round(timeout_s * 1e9)
+        while True:
+            self.drain()
+            if done():
+                return True
+            now = self._clock.now_ns()
+            if now >= deadline:
+                return False
+            self._clock.sleep_until(min(deadline, now + POLL_NS))
+
+    # --- about ------------------------------------------------------------------------------------------------------
+
+    def round_trip(self) -> RoundTrip:
+        """Return percentiles of the request-reply times, all 0 before the first reply."""
+        ordered = sorted(self.trips)
+        if not ordered:
+            return RoundTrip(0.0, 0.0, 0.0)
+        last = len(ordered) - 1
+        return RoundTrip(ordered[last // 2] * 1e-3, ordered[round(last * 0.99)] * 1e-3, ordered[last] * 1e-3)
+
+    def statistics(self) -> dict[str, object]:
+        """Return the counters, the estimated load (0 to 1) of the latest half second, and the round trips in us."""
+        return {
+            "sent": self.sent,
+            "received": self.received,
+            "error_frames": self.error_frames,
+            "unexpected": self.unexpected,
+            "send_failures": self.send_failures,
+            "load": self._load,
+            "state": self.state,
+            "round_trip_us": self.round_trip()._asdict(),
+        }
+
+    def close(self) -> None:
+        """Shut the bus down. Harmless when closed, or when the interface is gone."""
+        if self._closed:
+            return
+        self._closed = True
+        self._lost = self._lost or "the channel was closed"
+        try:
+            self._bus.shutdown()
+        except (can.CanError, OSError):
+            # An interface that has vanished cannot be closed properly; nothing is left to release.
+            self.state = "gone"
+
+    # --- trouble ----------------------------------------------------------------------------------------------------
+
+    def _send_failed(self, error: Exception) -> None:
+        self.send_failures += 1
+        codes = _codes(error)
+        if codes & _LOST:
+            raise self._lose(error) from error
+        now = self._clock.now_ns()
+        if self._failing_since is None:
+            self._failing_since = now
+        elif now - self._failing_since > FAILING_LIMIT_NS:
+            what = "the transmit queue stays full" if _is_full(error, codes) else str(error)
+            raise BusError(
+                f"no frame could be sent for {FAILING_LIMIT_NS * 1e-9:g} s: {what}",
+                "check motor power, termination and bit rates: nobody acknowledges. Take the interface down and up "
+                "before going on, since old frames wait in the kernel and would be sent when the power returns",
+            ) from error
+
+    def _receive_failed(self, error: Exception) -> None:
+        if _codes(error) & _LOST:
+            raise self._lose(error) from error
+        self.unexpected += 1
+
+    def _lose(self, error: Exception) -> BusError:
+        self._lost = f"the CAN interface is gone ({error})"
+        return self._gone()
+
+    def _gone(self) -> BusError:
+        return BusError(self._lost, "check the adapter and that the interface is up, then connect again")
+
+    def _on_error_frame(self, error_class: int, data: bytearray) -> None:
+        self.error_frames += 1
+        if error_class & _ERROR_BUS_OFF:
+            self.state = "bus-off"
+        elif error_class & _ERROR_RESTARTED:
+            self.state = "active"
+        elif error_class & _ERROR_CONTROLLER and len(data) > 1 and self.state != "bus-off":
+            if data[1] & _CONTROLLER_PASSIVE:
+                self.state = "passive"
+            elif data[1] & _CONTROLLER_ACTIVE:
+                self.state = "active"
+
+    def _measure_load(self, now: int) -> None:
+        elapsed = now - self._load_from
+        if elapsed >= _LOAD_WINDOW_NS:
+            frames = self.sent + self.received
+            self._load = (frames - self._load_frames) * self._frame_ns / elapsed
+            self._load_from, self._load_frames = now, frames
+
+
+def route_key(reply_id: int, motor: int) -> int:
+    """Return the key of `Transport.routes`: replies are told apart by their full id and the motor's low nibble.
+
+    The nibble counts since drives leave the factory with one and the same reply id.
+    """
+    return reply_id << 4 | motor & 0xF
+
+
+def frame_time_ns(fd: bool, bitrate: int, data_bitrate: int) -> float:
+    """Return the time on the wire of one frame of 8 bytes, standard id, worst-case bit stuffing.
+
+    Classic: 135 bits. FD: about 43 bits of arbitration and end at the nominal rate, 110 at the data rate (65 us at
+    1M/5M).
+    """
+    return 43e9 / bitrate + 110e9 / data_bitrate if fd else 135e9 / bitrate
+
+
+def _stamp(now: int, wall: float, timestamp: float) -> int:
+    """Return when a frame arrived, on our clock: its age by the kernel's stamp, if that is believable, before `now`.
+
+    Only the age is taken from the wall clock, so a step of it does harm for one frame and by at most 0.1 s.
+    """
+    age = wall - timestamp
+    return now - int(age * 1e9) if 0.0 < age < _OLDEST_STAMP_S else now
+
+
+def _poll_of(bus: can.BusABC) -> "select.poll | None":
+    try:
+        descriptor = bus.fileno()
+    except (NotImplementedError, can.CanError):
+        return None
+    if not isinstance(descriptor, int) or descriptor < 0:
+        return None
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    return poll
+
+
+def _codes(error: BaseException | None) -> set[int]:
+    """Return every errno in a chain of exceptions: python-can and pyserial each wrap the system's error."""
+    codes = set()
+    while error is not None:
+        for code in (getattr(error, "error_code", None), getattr(error, "errno", None)):
+            if isinstance(code, int):
+                codes.add(code)
+        error = error.__cause__ or error.__context__
+    return codes
+
+
+def _is_full(error: Exception, codes: set[int]) -> bool:
+    """Return whether the queue was full: socketcan says so without an errno (select) or with ENOBUFS (write)."""
+    return bool(codes & _FULL) or "buffer full" in str(error).lower()

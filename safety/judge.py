@@ -1,0 +1,51 @@
+"""Counts violations of the invariants, on the plant's true state where there is one, else on what was measured."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robotctl.hal.robot import Robot
+from robotctl.safety.machine import ENABLED
+
+POSITION_BOUND = 0.5e-3
+"""rad past a soft limit"""
+SPHERE_BOUND = 2e-3
+"""m outside the sphere"""
+
+
+class Judge:
+    """Takes tick records in any portions. Ticks with the drives off are not judged: nobody commands those."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._limits = robot.limits
+        self._centre = np.array(robot.profile.sphere.centre)
+        self._radius = robot.profile.sphere.radius
+        self._velocity_bound = robot.profile.safety.velocity_tolerance
+        self._enabled = np.array(sorted(ENABLED))
+        self.violations = {"position": 0, "velocity": 0, "sphere": 0}
+        """Ticks beyond each bound."""
+        self.worst = {"position": -np.inf, "velocity": -np.inf, "sphere": -np.inf}
+        """Largest excess over each limit seen, rad, rad/s and m; negative while inside."""
+        self.judged = 0
+        self.on_truth = True
+
+    def take(self, records: NDArray[Any]) -> None:
+        """Judge some tick records (`control.shared.tick_dtype`)."""
+        records = records[np.isin(records["state"], self._enabled)]
+        if not len(records):
+            return
+        truth = bool(records["has_truth"].all())
+        self.on_truth &= truth
+        prefix = "true_" if truth else ""
+        position, velocity, tool = (records[prefix + key] for key in ("position", "velocity", "tool"))
+        excess = {
+            "position": np.maximum(position - self._limits.upper, self._limits.lower - position).max(axis=1),
+            "velocity": (np.abs(velocity) - self._limits.velocity).max(axis=1),
+            "sphere": np.linalg.norm(tool - self._centre, axis=1) - self._radius,
+        }
+        bounds = {"position": POSITION_BOUND, "velocity": self._velocity_bound, "sphere": SPHERE_BOUND}
+        for key, values in excess.items():
+            self.violations[key] += int((values > bounds[key]).sum())
+            self.worst[key] = max(self.worst[key], float(values.max()))
+        self.judged += len(records)

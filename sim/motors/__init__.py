@@ -1,0 +1,1 @@
+"""Emulated drives that speak the wire byte for byte, in front of the MuJoCo plant."""

@@ -1,0 +1,65 @@
+"""Exit statuses and reports of the two verbs that look and do not touch."""
+
+import json
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from robotctl.cli.doctor import doctor
+from robotctl.cli.scan import scan
+
+
+@pytest.fixture
+def invoke():
+    def invoke(verb, *arguments):
+        app = typer.Typer()
+        app.command()(verb)
+        return CliRunner().invoke(app, list(arguments))
+
+    return invoke
+
+
+def test_scan_of_an_empty_bus(invoke, tmp_path):
+    report = tmp_path / "scan.json"
+    result = invoke(scan, "--channel", "virtual:empty", "--last", "2", "--json", str(report))
+    assert result.exit_code == 4
+    assert "nothing answered on the ids 1 to 2" in result.output
+    assert json.loads(report.read_text())["motors"] == []
+
+
+def test_scan_of_the_emulated_drives(invoke, tmp_path):
+    report = tmp_path / "scan.json"
+    result = invoke(scan, "--channel", "emulated", "--json", str(report))
+    assert result.exit_code == 0
+    motors = json.loads(report.read_text())["motors"]
+    assert [motor["id"] for motor in motors] == list(range(1, 9))
+    assert all(motor["identity"]["timeout_s"] > 0 for motor in motors)
+
+
+def test_scan_of_a_channel_that_is_not_there(invoke):
+    assert invoke(scan, "--channel", "socketcan:nosuch").exit_code == 4
+    assert invoke(scan, "--channel", "nonsense").exit_code == 2
+    assert invoke(scan, "--robot", "nonsense").exit_code == 2
+
+
+def test_doctor_without_a_channel(invoke, tmp_path):
+    report = tmp_path / "doctor.json"
+    result = invoke(doctor, "--json", str(report))
+    assert result.exit_code == 0
+    areas = {finding["area"] for finding in json.loads(report.read_text())["findings"]}
+    assert areas == {"host", "profile"}
+
+
+def test_doctor_with_the_emulated_drives(invoke):
+    assert invoke(doctor, "--channel", "emulated").exit_code == 0
+
+
+def test_doctor_on_a_silent_bus(invoke):
+    result = invoke(doctor, "--channel", "virtual:silent")
+    assert result.exit_code == 4
+    assert "does not answer" in result.output
+
+
+def test_doctor_on_a_missing_interface(invoke):
+    assert invoke(doctor, "--channel", "socketcan:nosuch").exit_code == 4

@@ -1,0 +1,72 @@
+"""What `doctor` says of a profile and of the drives that a scan found."""
+
+import pytest
+
+from robotctl.hal.can.channel import Channel
+from robotctl.hal.can.damiao.registers import Register
+from robotctl.hal.can.diagnosis import drive_findings, profile_findings
+from robotctl.hal.can.scan import scan
+from robotctl.hal.clock import VirtualClock
+from robotctl.hal.host import Level
+from robotctl.hal.robot import load_robot
+
+
+def findings(bench):
+    return drive_findings(bench.robot, scan(Channel(bench.bus, fd=True, simulated=True), VirtualClock()))
+
+
+def test_healthy_drives_are_fine(bench):
+    found = findings(bench)
+    assert len(found) == 8
+    assert all(finding.level is Level.OK for finding in found)
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "word"),
+    [
+        (lambda m: setattr(m, "mute", True), Level.FAIL, "does not answer"),
+        (lambda m: setattr(m, "reply_id", 0x44), Level.FAIL, "answers on 0x44"),
+        (lambda m: setattr(m, "status", 0xE), Level.FAIL, "OVERLOAD"),
+        (lambda m: m.registers.update({Register.TIMEOUT: 0}), Level.FAIL, "no watchdog"),
+        (lambda m: m.registers.update({Register.TIMEOUT: 8000}), Level.FAIL, "400 ms"),
+        (lambda m: m.registers.update({Register.VMAX: 8.0}), Level.FAIL, "ranges"),
+        (lambda m: m.registers.update({Register.CTRL_MODE: 2}), Level.WARN, "control mode 2"),
+    ],
+)
+def test_every_deviation_is_named(bench, change, level, word):
+    change(bench.motors[4])
+    bad = [finding for finding in findings(bench) if finding.level is not Level.OK]
+    assert [finding.level for finding in bad] == [level]
+    assert word in bad[0].text
+    assert "0x05" in bad[0].name
+    assert bad[0].remedy
+
+
+def test_shared_ids_and_strangers(bench, scripted_motor):
+    bench.bus.motors += [
+        scripted_motor(5, 0x15, bench.motors[4].ranges),
+        scripted_motor(20, 0x30, bench.motors[4].ranges),
+    ]
+    bad = [finding for finding in findings(bench) if finding.level is not Level.OK]
+    assert "2 motors share this id" in bad[0].text
+    assert bad[-1].level is Level.WARN
+    assert bad[-1].name == "0x14"
+
+
+def test_bus_load_of_classic_can_is_too_much_at_500_hz():
+    robot = load_robot("panda", ["can.fd=false"])
+    load = next(finding for finding in profile_findings(robot) if finding.name == "bus load")
+    assert load.level is Level.FAIL
+    assert "108 %" in load.text
+    assert "347" in load.remedy
+
+
+def test_a_profile_without_drives_is_only_a_warning():
+    found = profile_findings(load_robot("kinova"))
+    assert Level.FAIL not in [finding.level for finding in found]
+    assert any("simulation only" in finding.text for finding in found)
+
+
+def test_a_sphere_gain_too_high_for_the_lag():
+    robot = load_robot("panda", ["twin.lag_s=0.1"])
+    assert any(finding.name == "sphere_gain" and "2.50" in finding.remedy for finding in profile_findings(robot))
