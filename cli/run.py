@@ -20,7 +20,7 @@ from robotctl.hal.robot import load_robot
 from robotctl.learning.actor import Actor, InlineActor, ProcessActor
 from robotctl.learning.policies import POLICIES
 from robotctl.learning.run import Episode, Outcome, report, run_episodes
-from robotctl.learning.task import load_task
+from robotctl.learning.task import ReachTask, load_task
 
 
 class Terminated(BaseException):
@@ -59,7 +59,7 @@ def run(
             actor = ProcessActor(session, work, policy, seed, overrides)
         path = record or Path("recordings") / f"{datetime.now():%Y%m%d-%H%M%S}-{model.profile.name}-{backend}.mcap"
         console.print(f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}")
-        outcome, result = _run(console, session, actor, path, about, episodes, seed, work)
+        outcome, result = _run(console, session, actor, path, about, overrides, episodes, seed, work)
         _summarise(console, result)
         if json is not None:
             write_json(json, result)
@@ -74,9 +74,10 @@ def _run(
     actor: Actor,
     path: Path,
     about: dict[str, Any],
+    overrides: list[str],
     episodes: int,
     seed: int,
-    task: Any,
+    task: ReachTask,
 ) -> tuple[Exit, dict[str, Any]]:
     def on_episode(index: int, episode: Episode) -> None:
         mark = "[green]reached[/]" if episode.success else "[yellow]missed[/] "
@@ -93,7 +94,7 @@ def _run(
     outcome = Outcome()
     before = signal.signal(signal.SIGTERM, terminate)
     try:
-        with session, record_session(session, path, about, on_trip) as recording, actor:
+        with session, record_session(session, path, about, on_trip, overrides) as recording, actor:
             try:
                 with stop_keys(lambda: session.link.desk.ask(Verb.ESTOP)):
                     outcome = run_episodes(session, actor, task, episodes, seed, on_episode)
@@ -105,7 +106,7 @@ def _run(
                 console.print(f"  {outcome.stopped}: braking, then drives off")
                 session.bring_to_rest(kind)
             state = session.state.name
-        result = report(session, outcome, about, recording.summary())
+        result = report(session, outcome, about, recording)
         result["safety"]["state"] = state
         result["processes"] = recording.processes | {"policy": actor.pid}
     finally:
@@ -125,6 +126,8 @@ def _summarise(console: Console, result: dict[str, Any]) -> None:
     if result["stopped"]:
         console.print("[bold red]stopped[/]", end=" ")
         console.print(result["stopped"], markup=False)
-    recording = result["recording"]
-    if recording:
-        console.print(f"recording {recording}", markup=False)
+    for problem in result["recording_problems"]:
+        console.print("[yellow]recording[/]", end=" ")
+        console.print(problem, markup=False)
+    for path in filter(None, [result["recording"], *result["black_boxes"]]):
+        console.print(f"recording {path}", markup=False, soft_wrap=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -46,9 +47,9 @@ def scan(
 
 def motor_table(found: Scan, channel: str) -> Table:
     """Return what a scan found, one row per motor."""
-    table = Table(title=f"drives on {channel}")
-    for heading in ("id", "reply", "motor", "sw", "mode", "watchdog", "position", "MOSFET / rotor", "status"):
-        table.add_column(heading)
+    table = Table(title=f"drives on {channel}", box=box.SIMPLE_HEAD, padding=0)
+    for heading in ("id", "reply", "motor", "sw", "mode", "watchdog\nms", "angle\nrad", "temp.\n°C", "status"):
+        table.add_column(heading, overflow="fold")
     for motor in found.motors:
         table.add_row(*_row(motor))
     return table
@@ -78,8 +79,8 @@ def _row(motor: FoundMotor) -> tuple[str, ...]:
         " or ".join(motor.models) or "unknown",
         str(identity.software),
         ControlMode(identity.mode).name if known else f"? {identity.mode}",
-        f"{identity.timeout_s * 1e3:g} ms" if identity.timeout_s else "[bold red]off[/]",
-        f"{motor.position:.4f} rad",
-        f"{motor.mosfet_temperature} / {motor.rotor_temperature} °C",
+        f"{identity.timeout_s * 1e3:g}" if identity.timeout_s else "[bold red]off[/]",
+        f"{motor.position:.3f}",
+        f"{motor.mosfet_temperature}, {motor.rotor_temperature}",
         motor.status,
     )

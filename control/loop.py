@@ -141,7 +141,7 @@ class Loop:
             self._cut(sample, now)
         if self._gripper is not None:
             self._gripper.step()
-        if supervisor.state is not self._state or self._reported != len(supervisor.reactions):
+        if supervisor.state is not self._state or self._reported != len(supervisor.trips):
             self._report(now)
         self._publish(sample, tool, now)
 
@@ -170,14 +170,17 @@ class Loop:
 
     def _track(self, wanted: Vector, sample: Sample) -> None:
         reference = self._reference
-        category = self.supervisor.category
-        if category is Category.BRAKE_OFF:
-            limited = self._shaper.brake(reference.velocity)
+        if wanted is self._zero and not reference.velocity.any():
+            velocity, clip = self._zero, Clip.NONE  # at rest, to stay so: outside the limits, too
         else:
-            limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
-        tool, jacobian = self.kinematics.tool_and_jacobian(reference.position)
-        velocity, clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
-        self._wanted, self._clip = wanted, clip
+            if self.supervisor.category is Category.BRAKE_OFF:
+                limited = self._shaper.brake(reference.velocity)
+            else:
+                limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
+            tool, jacobian = self.kinematics.tool_and_jacobian(reference.position)
+            velocity, clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
+        self._wanted = wanted
+        self._clip = clip | Clip.RECOVERY if self.supervisor.recovery else clip
         self._command = reference.step(velocity, sample.position)
         self._arm.write(self._command)
 
@@ -185,7 +188,7 @@ class Loop:
         """Send a torque command if the present motion can still be stopped inside all limits; else trip."""
         trip = self._stoppable.check(sample)
         if trip is not None:
-            self.supervisor.trip(trip, now)
+            self.supervisor.trip(trip)
             return False
         gravity = self.kinematics.gravity(sample.position)
         previous = self._command.effort if self._torque is None else self._torque
@@ -233,7 +236,7 @@ class Loop:
             return self._zero
         if now > self._routine_ends_ns:
             cause = f"reset routine {routine.name!r} did not arrive within {routine.timeout_s:g} s"
-            self.supervisor.trip(Trip(Protection.RESET, Category.BRAKE_HOLD, cause, self._routine_ends_ns), now)
+            self.supervisor.trip(Trip(Protection.RESET, Category.BRAKE_HOLD, cause, self._routine_ends_ns))
             return self._zero
         return velocity
 
@@ -256,6 +259,8 @@ class Loop:
                 supervisor.handle(Event.ARM)
                 self._enable(now)
             case Verb.START:
+                if supervisor.recovery:
+                    raise Refused(supervisor.state, Event.START)
                 supervisor.handle(Event.START)
                 supervisor.admission.renew(now)
             case Verb.HOME:
@@ -297,9 +302,11 @@ class Loop:
         try:
             self._arm.enable()
         except RobotctlError as error:
-            self.supervisor.trip(Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), now), now)
+            self.supervisor.trip(Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), now))
             raise
-        self._reference.resync(self._arm.read().position, self._zero)
+        sample = self._arm.read()
+        self._reference.resync(sample.position, self._zero)
+        self.supervisor.begin_recovery_if_outside(sample, self.kinematics.tool(sample.position))
 
     def _close(self, now: int) -> None:
         """Release the arm at once, or after a damped one was lowered."""
@@ -313,26 +320,25 @@ class Loop:
     def _serve_estop(self, now: int) -> None:
         cause = f"emergency stop by {self._estop}; release it, then acknowledge"
         self._estop = ""
-        self.supervisor.trip(Trip(Protection.ESTOP, Category.BRAKE_OFF, cause, now), now)
+        self.supervisor.trip(Trip(Protection.ESTOP, Category.BRAKE_OFF, cause, now))
 
     # -- publishing -----------------------------------------------------------------------------------------------
 
     def _report(self, now: int) -> None:
         supervisor = self.supervisor
         events = self._link.events
-        for reaction in supervisor.reactions[self._reported :]:
-            trip = reaction.trip
+        for trip in supervisor.trips[self._reported :]:
             events.write(
                 {
                     "type": "trip",
                     "stamp_ns": now,
                     "protection": trip.protection.label,
                     "stop_category": int(trip.category),
-                    "reaction_ms": round(reaction.reaction_ms, 3),
+                    "reaction_ms": round((self._clock.now_ns() - trip.onset_ns) / 1e6, 3),
                     "text": trip.cause,
                 }
             )
-        self._reported = len(supervisor.reactions)
+        self._reported = len(supervisor.trips)
         if supervisor.state is not self._state:
             text = f"{self._state.name} -> {supervisor.state.name}"
             events.write({"type": "state", "stamp_ns": now, "state": supervisor.state.name, "text": text})

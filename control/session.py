@@ -16,6 +16,7 @@ from robotctl.hal.errors import HardwareError, RobotctlError
 from robotctl.hal.robot import Robot
 from robotctl.safety.judge import Judge
 from robotctl.safety.machine import State
+from robotctl.safety.shaper import Clip
 
 HISTORY_S = 60.0
 """How much the ring of ticks remembers: the black box."""
@@ -48,6 +49,7 @@ class Session(ABC):
         self.trips: list[dict[str, Any]] = []
         self.on_event: Callable[[dict[str, Any]], None] | None = None
         self.on_trip: Callable[[dict[str, Any]], None] | None = None
+        self.on_poll: Callable[[], None] | None = None
         self._answers: dict[int, dict[str, Any]] = {}
         self._tick_cursor = 0
         self._event_cursor = 0
@@ -104,6 +106,8 @@ class Session(ABC):
 
     def poll(self) -> None:
         """Take in what happened since the last call: ticks into judge and statistics, trips and answers from events."""
+        if self.on_poll is not None:
+            self.on_poll()
         records, self._tick_cursor, dropped = self.link.ticks.since(self._tick_cursor)
         self.judge.take(records)
         self.statistics.take(records, dropped)
@@ -157,8 +161,11 @@ class Session(ABC):
         self.wait_for(State.ARMED, timeout_s=90.0)
 
     def prepare(self) -> None:
-        """Arm, and go home."""
+        """Arm, retreat if the arm stands outside its limits, and go home."""
         self.request(Verb.ARM)
+        self.advance(self.robot.period_ns * 1e-9)
+        if self.latest()["clip"] & Clip.RECOVERY:
+            self.reset(Verb.RETREAT)
         self.reset()
 
     def begin(self) -> None:

@@ -200,8 +200,8 @@ class TickRing:
 class EventRing:
     """The last events (state changes, trips, answers, log lines) as JSON texts."""
 
-    SLOT = 1024
-    SLOTS = 256
+    SLOT = 4096
+    SLOTS = 128
     SIZE = 8 + SLOT * SLOTS
 
     def __init__(self, buffer: Buffer, offset: int) -> None:
@@ -209,12 +209,15 @@ class EventRing:
         self._offset = offset
 
     def write(self, event: dict[str, object]) -> None:
-        """Append one event; a text too long for a slot loses its end of `text`."""
+        """Append one event; of one that is too long for a slot, its `text` is cut, or all but the type is lost."""
         data = json.dumps(event).encode()
-        if len(data) > self.SLOT - 4:
-            excess = len(data) - (self.SLOT - 4)
-            text = str(event.get("text", ""))
-            data = json.dumps({**event, "text": text[: max(0, len(text) - 2 * excess)]}).encode()[: self.SLOT - 4]
+        room = self.SLOT - 4
+        if len(data) > room:
+            text = str(event.get("text", ""))[: room // 8]
+            data = json.dumps({**event, "text": text}).encode()
+        if len(data) > room:
+            short = {"type": event["type"], "stamp_ns": event.get("stamp_ns", 0), "text": "(too long to be kept)"}
+            data = json.dumps(short).encode()
         head = _HEAD.unpack_from(self._buffer, self._offset)[0]
         at = self._offset + 8 + head % self.SLOTS * self.SLOT
         struct.pack_into("<I", self._buffer, at, len(data))

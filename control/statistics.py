@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robotctl.safety.shaper import Clip
+
 
 def percentiles_us(nanoseconds: NDArray[Any]) -> dict[str, float] | None:
     """Return p50, p99, p999 and max in microseconds; None without data."""
@@ -37,7 +39,7 @@ class TickStatistics:
         self._durations.append(records["duration_ns"].copy())
         self._lateness.append(records["lateness_ns"].copy())
         self.ticks += len(records)
-        self.clipped += int((records["clip"] != 0).sum())
+        self.clipped += int((records["clip"] & ~Clip.RECOVERY != 0).sum())
         self.overruns += int((records["lateness_ns"] > self._period_ns).sum())
         if self._first_ns is None:
             self._first_ns = int(records["stamp_ns"][0])

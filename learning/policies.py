@@ -31,6 +31,10 @@ class Observation(NamedTuple):
     """Policy steps since the episode began."""
 
 
+_BEHAVES = 10
+"""Policy steps for which the treacherous ones behave."""
+
+
 class Stall(Exception):  # noqa: N818 - a behaviour, not an error
     """The policy stops answering."""
 
@@ -106,38 +110,38 @@ class Outward(Policy):
 
 
 class NotANumber(Policy):
-    """Behaves for a second, then sends NaN."""
+    """Behaves for half a second, then sends NaN."""
 
     def __init__(self, robot: Robot, kinematics: Kinematics, seed: int = 0) -> None:
         self._scripted = Scripted(robot, kinematics)
 
     def act(self, observation: Observation) -> Vector:
         velocity = self._scripted.act(observation)
-        if observation.step >= 20:
+        if observation.step >= _BEHAVES:
             velocity[0] = np.nan
         return velocity
 
 
 class Stalling(Policy):
-    """Behaves for a second, then hangs."""
+    """Behaves for half a second, then hangs."""
 
     def __init__(self, robot: Robot, kinematics: Kinematics, seed: int = 0) -> None:
         self._scripted = Scripted(robot, kinematics)
 
     def act(self, observation: Observation) -> Vector:
-        if observation.step >= 20:
+        if observation.step >= _BEHAVES:
             raise Stall
         return self._scripted.act(observation)
 
 
 class Dying(Policy):
-    """Behaves for a second, then its process is killed."""
+    """Behaves for half a second, then its process is killed."""
 
     def __init__(self, robot: Robot, kinematics: Kinematics, seed: int = 0) -> None:
         self._scripted = Scripted(robot, kinematics)
 
     def act(self, observation: Observation) -> Vector:
-        if observation.step >= 20:
+        if observation.step >= _BEHAVES:
             raise Die
         return self._scripted.act(observation)
 

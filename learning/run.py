@@ -9,6 +9,7 @@ import numpy as np
 
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.loop import Verb
+from robotctl.control.recording_session import SessionRecording
 from robotctl.control.session import Session, Stopped
 from robotctl.hal.types import Vector
 from robotctl.learning.actor import Actor
@@ -80,10 +81,11 @@ def _run_episode(session: Session, actor: Actor, task: ReachTask, goal: Vector, 
     session.begin()
     settled = step = 0
     distance = math.inf
-    rate.begin(session)
     for step in range(1, task.steps + 1):
         actor.step()
         session.advance(period)
+        if step == 2:  # the policy has seen the start by now
+            rate.begin(session)
         record = session.latest()
         tool = record["true_tool"] if record["has_truth"] else record["tool"]
         distance = float(np.linalg.norm(tool - goal))
@@ -93,7 +95,7 @@ def _run_episode(session: Session, actor: Actor, task: ReachTask, goal: Vector, 
             break
     rate.end(session)
     actor.rest()
-    return Episode(distance <= task.success, distance, step)
+    return Episode(distance <= task.success and session.state is State.RUN, distance, step)
 
 
 def _may_continue(session: Session, state: State) -> bool:
@@ -118,23 +120,26 @@ class _RateMeter:
     def __init__(self) -> None:
         self._targets = 0
         self._ns = 0
-        self._begun = (0, 0)
+        self._begun: tuple[int, int] | None = None
 
     def begin(self, session: Session) -> None:
         record = session.latest()
         self._begun = (int(record["seq"]), int(record["stamp_ns"]))
 
     def end(self, session: Session) -> None:
+        if self._begun is None:
+            return
         record = session.latest()
         self._targets += int(record["seq"]) - self._begun[0]
         self._ns += int(record["stamp_ns"]) - self._begun[1]
+        self._begun = None
 
     @property
     def hz(self) -> float:
         return round(self._targets / self._ns * 1e9, 2) if self._ns else 0.0
 
 
-def report(session: Session, outcome: Outcome, about: dict[str, Any], recording: str | None) -> dict[str, Any]:
+def report(session: Session, outcome: Outcome, about: dict[str, Any], recording: SessionRecording) -> dict[str, Any]:
     """Return the report of a run, as `--json` writes it.
 
     `about` names backend, robot, task and seed. `violations` are counted on the plant's true state where there is
@@ -166,6 +171,6 @@ def report(session: Session, outcome: Outcome, about: dict[str, Any], recording:
         },
         "timing": {**session.statistics.report(), "policy_hz": outcome.policy_hz},
         "can": session.bus_statistics(),
-        "recording": recording,
+        **recording.report(),
         "stopped": outcome.stopped,
     }

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from robotctl.hal.robot import Robot
 from robotctl.safety.machine import ENABLED
+from robotctl.safety.shaper import Clip
 
 POSITION_BOUND = 0.5e-3
 """rad past a soft limit"""
@@ -15,7 +16,11 @@ SPHERE_BOUND = 2e-3
 
 
 class Judge:
-    """Takes tick records in any portions. Ticks with the drives off are not judged: nobody commands those."""
+    """Takes tick records in any portions.
+
+    Not judged are ticks with the drives off, when nobody commands the arm, and those of an arm that began outside
+    its limits and has not finished its retreat.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._limits = robot.limits
@@ -32,7 +37,7 @@ class Judge:
 
     def take(self, records: NDArray[Any]) -> None:
         """Judge some tick records (`control.shared.tick_dtype`)."""
-        records = records[np.isin(records["state"], self._enabled)]
+        records = records[np.isin(records["state"], self._enabled) & (records["clip"] & Clip.RECOVERY == 0)]
         if not len(records):
             return
         truth = bool(records["has_truth"].all())

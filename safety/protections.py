@@ -17,8 +17,13 @@ class PositionBreach:
     def __init__(self, robot: Robot) -> None:
         breach = robot.profile.safety.position_breach
         self._names = [joint.name for joint in robot.profile.joints]
+        self._limits = robot.limits
         self._middle = 0.5 * (robot.limits.upper + robot.limits.lower)
         self._half = 0.5 * (robot.limits.upper - robot.limits.lower) + breach
+
+    def inside(self, position: Vector) -> bool:
+        """Return whether all joints (n,) are within their soft limits."""
+        return bool(((position >= self._limits.lower) & (position <= self._limits.upper)).all())
 
     def check(self, sample: Sample) -> Trip | None:
         beyond = np.abs(sample.position - self._middle) - self._half

@@ -49,7 +49,8 @@ class Clip(IntFlag):
     POSITION = 2
     SPHERE = 4
     PREDICTED_STOP = 8
-    TORQUE = 16
+    RECOVERY = 16
+    """Not a limit: the arm began outside its limits, and only a retreat may move it."""
 
 
 class Shaped(NamedTuple):
@@ -89,8 +90,10 @@ class Shaper:
         self._speed_reach = np.full(self._n, model.reach)
         self._travel_reach = model.reach * (self._dt + self.velocity_cap / (2.0 * self.acceleration_cap))
         self._hessian = np.eye(self._n)
-        self._sense = np.zeros(self._n + 1, dtype=np.int32)
-        self._sense[-1] = _SOFT
+        # Where braking within the acceleration caps cannot keep the row, the row gives way, not the caps.
+        self._firm = np.zeros(self._n + 1, dtype=np.int32)
+        self._giving = self._firm.copy()
+        self._giving[-1] = _SOFT
         self._bounds = np.empty((2, self._n + 1))
         self._bounds[0, -1] = -1e30
 
@@ -141,11 +144,11 @@ class Shaper:
     def _position_bound(self, mirrored: Vector) -> Vector:
         """Return the speed towards each limit from which braking ends there: v dt/2 + v^2/(2 a) <= room.
 
-        Past the edge the step has to lead back: v dt/2 = room.
+        Past the edge it is zero: no further out. Only a reset routine leads back in.
         """
-        room = self._edge - mirrored
-        root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * np.maximum(room, 0.0)) - self._half_step2
-        return np.minimum(np.where(room >= 0.0, root, (2.0 / self._dt) * room), self._cap2)
+        room = np.maximum(self._edge - mirrored, 0.0)
+        root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * room) - self._half_step2
+        return np.minimum(root, self._cap2)
 
     def _into_sphere(
         self, best: Vector, wanted: Vector, lower: Vector, upper: Vector, row: Row, tool: Vector, jacobian: Vector
@@ -158,10 +161,13 @@ class Shaper:
         bounds[0, :-1] = lower
         bounds[1, :-1] = upper
         bounds[1, -1] = row.bound
-        solution, _, flag, _ = daqp.solve(self._hessian, -wanted, row.normal[np.newaxis], bounds[1], bounds[0], self._sense)
-        if flag not in _SOLVED:
-            return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
-        return np.minimum(np.maximum(solution, lower), upper)
+        for sense in (self._firm, self._giving):
+            solution, _, flag, _ = daqp.solve(
+                self._hessian, -wanted, row.normal[np.newaxis], bounds[1], bounds[0], sense
+            )
+            if flag in _SOLVED:
+                return np.minimum(np.maximum(solution, lower), upper)
+        return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
 
     def _stops_inside(self, position: Vector, velocity: Vector, following: Vector, tool: Vector) -> bool:
         """Return whether braking from `following` ends inside the sphere or, already outside, no further out."""

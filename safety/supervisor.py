@@ -4,8 +4,6 @@ One object for twin and hardware. It reads no clock and does no I/O: samples, ta
 states, trips and admitted targets go out.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from robotctl.hal.robot import Robot
@@ -27,17 +25,6 @@ _STANDSTILL_TICKS = 5
 _STOP_ALLOWANCE_S = 0.5
 
 
-class Reaction(NamedTuple):
-    """A trip together with when the arm was first told to stop."""
-
-    trip: Trip
-    stamp_ns: int
-
-    @property
-    def reaction_ms(self) -> float:
-        return (self.stamp_ns - self.trip.onset_ns) / 1e6
-
-
 class Supervisor:
     """State machine, protections and admission of one arm."""
 
@@ -51,8 +38,8 @@ class Supervisor:
         """The trip that is latched, if the arm was not stopped by its operator."""
         self.recovery = False
         """Whether only the retreat routine may move the arm."""
-        self.reactions: list[Reaction] = []
-        """Every trip of this supervisor's life, oldest first; the arm's black box."""
+        self.trips: list[Trip] = []
+        """Every trip of this supervisor's life, oldest first."""
         self.admission = Admission(robot)
         self.feedback = FeedbackAge(robot)
         self._position = PositionBreach(robot)
@@ -92,7 +79,7 @@ class Supervisor:
             self._settled = 0
         return self.state
 
-    def trip(self, trip: Trip, now_ns: int) -> bool:
+    def trip(self, trip: Trip) -> bool:
         """Stop the arm for `trip`; a trip that is softer than the stop in force changes nothing.
 
         Returns whether it took effect.
@@ -109,7 +96,7 @@ class Supervisor:
         else:
             return False
         self.cause = trip
-        self.reactions.append(Reaction(trip, now_ns))
+        self.trips.append(trip)
         return True
 
     # -- asked in every tick --------------------------------------------------------------------------------------
@@ -134,7 +121,7 @@ class Supervisor:
         if trip is None and state is State.RUN:
             trip = self.admission.heartbeat(now_ns)
         if trip is not None:
-            self.trip(trip, now_ns)
+            self.trip(trip)
         if self.state is State.STOPPING:
             self._watch_standstill(sample, now_ns)
         else:
@@ -142,12 +129,17 @@ class Supervisor:
         if self.state in (State.STOPPING, State.HOLD):
             self._clear_heartbeat(now_ns)
 
+    def begin_recovery_if_outside(self, sample: Sample, tool: Vector) -> None:
+        """When armed outside its limits or its sphere, the arm may do nothing but retreat."""
+        if not self._position.inside(sample.position) or self._sphere.outside(tool) > 0.0:
+            self.recovery = True
+
     def offer(self, target: Target, now_ns: int) -> None:
         """Take a new target from the mailbox; malformed ones stop the arm."""
         if self.state in _LISTENING:
             trip = self.admission.offer(target, self.epoch, now_ns)
             if trip is not None:
-                self.trip(trip, now_ns)
+                self.trip(trip)
 
     def admitted(self, now_ns: int) -> Target | None:
         """Return the policy's target if it may move the arm now; None means brake and hold."""

@@ -35,7 +35,7 @@ class Plant:
     """
 
     def __init__(self, robot: Robot, start_ns: int = 0) -> None:
-        """Build the plant at rest in the profile's home pose, all drives off."""
+        """Build the plant in the profile's rest pose, all drives off."""
         profile = robot.profile
         self.time_ns = start_ns
         self.dof = robot.dof
@@ -68,7 +68,9 @@ class Plant:
         self._brakes = profile.brakes
         for axis in range(self.axes):
             self.release(axis)
-        self.place(np.array(profile.home))
+        # Until its drives come on, an arm lies in its cradle.
+        self.model.dof_frictionloss[self._dofs[: self.dof]] = _BRAKE_TORQUE
+        self.place(np.array(profile.rest))
 
     def place(self, position: Vector) -> None:
         """Put the arm at rest at `position`, rad. For starts and tests; a real arm has no such thing."""

@@ -75,9 +75,8 @@ def open_channel(name: str, robot: Robot, clock: Clock) -> Channel:
             f"unknown channel {name!r}: python-can has no interface {interface!r}",
             f"use {FORMS}: {', '.join(sorted(can.VALID_INTERFACES))}",
         )
-    bus = open_bus(interface, where, _options(interface, wiring))
-    fd = wiring.fd if interface == "virtual" else bus.protocol is not can.CanProtocol.CAN_20
-    return Channel(bus, fd and wiring.fd)
+    bus = open_bus(interface, where, options(interface, wiring))
+    return Channel(bus, fd=wiring.fd and bus.protocol is not can.CanProtocol.CAN_20)
 
 
 def open_bus(interface: str, where: str, options: Mapping[str, Any]) -> can.BusABC:
@@ -92,7 +91,8 @@ def open_bus(interface: str, where: str, options: Mapping[str, Any]) -> can.BusA
         raise BusError(f"cannot open {interface}:{where}: {error}", _remedy(interface, where, error)) from error
 
 
-def _options(interface: str, wiring: CanBus) -> dict[str, Any]:
+def options(interface: str, wiring: CanBus) -> dict[str, Any]:
+    """Return what an interface of python-can has to be told of the wiring."""
     match interface:
         case "virtual":
             return {"protocol": can.CanProtocol.CAN_FD if wiring.fd else can.CanProtocol.CAN_20}

@@ -39,8 +39,8 @@ POLL_NS = 500_000
 
 _LOST = frozenset({errno.ENODEV, errno.ENXIO, errno.ENETDOWN, errno.ENETUNREACH, errno.EBADF, errno.EIO})
 _FULL = frozenset({errno.ENOBUFS, errno.EAGAIN})
-_READ_ERRORS = (can.CanError, OSError, ValueError, IndexError, struct.error)
-"""What python-can's readers raise; the last three for garbage on a serial line."""
+_READ_ERRORS = (can.CanError, OSError, ValueError, IndexError, struct.error, AssertionError)
+"""What python-can's readers raise; the latter four for frames they cannot parse."""
 _READ_RETRIES = 8
 _OLDEST_STAMP_S = 0.1
 _LOAD_WINDOW_NS = 500_000_000

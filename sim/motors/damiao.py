@@ -48,6 +48,7 @@ class DamiaoDrive:
     def __init__(
         self,
         name: str,
+        model: str,
         memory: Memory,
         shaft: Shaft,
         changed: Callable[[], None],
@@ -60,12 +61,17 @@ class DamiaoDrive:
 
         Args:
             name: the joint's.
+            model: e.g. DM8009.
+            memory: its registers.
+            shaft: what it turns.
             changed: called after everything that is more than a command in the present mode: ids, modes, status.
             defer: calls back at a later time.
             delay_ns: dead time until a motion command acts.
             noise: standard deviations of the reported position (rad) and speed (rad/s).
+            seed: of the noise.
         """
         self.name = name
+        self.model = model
         self.memory = memory
         self.shaft = shaft
         self.powered = False
@@ -124,6 +130,11 @@ class DamiaoDrive:
         """Lose the supply: no torque, no answers, and nothing kept that is not in flash."""
         self.powered = False
         self._leave(Status.DISABLED)
+
+    def preset(self, register: int, value: float) -> None:
+        """Set any register, in flash and in RAM, as if the drive had come that way."""
+        self.memory.preset(register, value)
+        self._adopt()
 
     def fail(self, status: int) -> None:
         """Report a fault from now on; it takes the drive out of enable mode and stays until it is cleared."""
@@ -238,7 +249,7 @@ class DamiaoDrive:
                 return encode_register(motor, RegisterCommand.SAVE, frame.register)
 
     def feedback(self) -> bytes:
-        """Return the 8 bytes of a feedback frame; the same as `codec.encode_feedback` with factors worked out before."""
+        """Return the 8 bytes of a feedback frame: `codec.encode_feedback` with its factors worked out beforehand."""
         position, velocity, effort = self.shaft.state()
         if self._noise is not None:
             position += self._random.gauss(0.0, self._noise[0])

@@ -21,12 +21,12 @@ _FASTER_CODES = (10, 11)
 """8 and 10 Mbit/s, newer firmware only; a drive that has stored one falls back to 1 Mbit/s at power-up."""
 
 
-def factory_values(motor: str, motor_id: int, reply_id: int, mode: ControlMode, timeout: int, fd: bool) -> dict[int, float]:
+def factory_values(
+    motor: str, motor_id: int, reply_id: int, mode: ControlMode, timeout: int, fd: bool
+) -> dict[int, float]:
     """Return plausible contents of the flash of a drive as an integrator leaves it.
 
-    Args:
-        timeout: watchdog, counts of 50 us.
-        fd: whether it is set to CAN FD at 5 Mbit/s, else classic at 1 Mbit/s.
+    `timeout` is the watchdog's, in counts of 50 us; `fd` sets CAN FD at 5 Mbit/s, else classic at 1 Mbit/s.
     """
     pmax, vmax, tmax = MOTORS[motor]
     values = dict.fromkeys(REGISTERS, 0.0)

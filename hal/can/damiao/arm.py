@@ -12,12 +12,13 @@ import numpy as np
 from robotctl.hal.arm import Arm
 from robotctl.hal.can.channel import Channel, open_channel
 from robotctl.hal.can.damiao.codec import KD_MAX, KP_MAX, Special, Status
-from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, DrivesError, Identity
-from robotctl.hal.can.damiao.faults import fault_of, is_fault, status_name
+from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, DrivesError, Identity, raise_problems
+from robotctl.hal.can.damiao.faults import fault_of, status_name
 from robotctl.hal.can.damiao.gripper import DamiaoGripper
 from robotctl.hal.can.damiao.motors import MOTORS
+from robotctl.hal.can.damiao.power import clear_faults, not_ready, switch_off
 from robotctl.hal.can.damiao.registers import ControlMode
-from robotctl.hal.can.damiao.verification import Eavesdropper, Expected, plausible_turns, verify_drive
+from robotctl.hal.can.damiao.verification import Eavesdropper, Expected, verify_drive
 from robotctl.hal.can.transport import Transport, route_key
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError, DriveError, HardwareError
@@ -25,9 +26,6 @@ from robotctl.hal.profile import CanBus
 from robotctl.hal.profile import Drive as DriveProfile
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Truth, Vector, frozen
-
-DISABLE_TRIES = 10
-"""Disable frames before a drive counts as one that cannot be switched off (axol uses 10)."""
 
 _POLL_PERIOD_NS = 3_500_000
 """Between two requests for feedback while the drives are off; every second tick at 500 Hz, 40 % load on FD."""
@@ -152,7 +150,7 @@ class DamiaoArm(Arm):
                     self.warnings.append(f"{drive.name}: was already enabled")
         finally:
             transport.listener = None
-        _raise(problems)
+        raise_problems(problems)
         self._verified = True
 
     def enable(self) -> None:
@@ -166,7 +164,7 @@ class DamiaoArm(Arm):
         transport = self._require_open()
         if not self._verified:
             raise HardwareError("the drives are not verified", "call verify() first")
-        _raise(self._not_ready())
+        raise_problems(not_ready(self._drives, self._expected))
         if self._enabled and all(drive.status == Status.ENABLED for drive in self._drives):
             return
         try:
@@ -277,19 +275,11 @@ class DamiaoArm(Arm):
             self.gripper.release()
         if not self._open:
             return
-        transport = self._require_open()
-        waiting = self._drives
-        for _ in range(DISABLE_TRIES):
-            marks = [(drive, drive.heard) for drive in waiting]
-            for drive in waiting:
-                drive.special(Special.DISABLE)
-            transport.wait(lambda marks=marks: not _unconfirmed(marks), CONFIRM_TIMEOUT_S)  # type: ignore[misc]
-            waiting = _unconfirmed(marks)
-            if not waiting:
-                return
-        self._verified = False
-        remedy = "cut the power of the drives; without frames their watchdogs should have acted"
-        _raise([drive.error(f"did not confirm {DISABLE_TRIES} disable frames", remedy) for drive in waiting])
+        try:
+            switch_off(self._drives, self._require_open())
+        except (DriveError, DrivesError):
+            self._verified = False
+            raise
 
     def clear_faults(self) -> None:
         """Clear the fault of every drive that reports one. Enables nothing.
@@ -299,20 +289,7 @@ class DamiaoArm(Arm):
             BusError: if the bus is gone.
         """
         self._require_open()
-        problems = []
-        for drive in self._drives:
-            try:
-                drive.refresh()
-                if is_fault(drive.status):
-                    drive.answers(Special.CLEAR_ERROR)
-                    drive.refresh()
-            except DriveError as silent:
-                problems.append(silent)
-                continue
-            if is_fault(drive.status):
-                fault = fault_of(drive.name, drive.status)
-                problems.append(drive.error(f"keeps its fault {fault.name}", fault.hint))
-        _raise(problems)
+        clear_faults(self._drives)
 
     def close(self) -> None:
         self._verified = self._enabled = False
@@ -360,27 +337,6 @@ class DamiaoArm(Arm):
         if transport.simulated:
             transport.drain()
 
-    def _not_ready(self) -> list[DriveError]:
-        """Ask every drive how it is, and return what forbids enabling."""
-        problems = []
-        for drive, expected in zip(self._drives, self._expected, strict=True):
-            try:
-                drive.refresh()
-            except DriveError as silent:
-                problems.append(silent)
-                continue
-            if is_fault(drive.status):
-                fault = fault_of(drive.name, drive.status)
-                problems.append(drive.error(f"reports {fault.name}", f"{fault.hint}; then clear the fault"))
-            if expected.bounds and 0 not in plausible_turns(drive.position, expected.bounds, expected.turn):
-                problems.append(
-                    drive.error(
-                        f"measures {drive.position:.4f} rad, outside its joint's range",
-                        "verify the drives again: one that lost its power may have woken up a turn off",
-                    )
-                )
-        return problems
-
     def _enable_all(self, transport: Transport) -> None:
         holding: list[tuple[Drive, bytes]] = []
         for drive in self._drives:
@@ -403,7 +359,7 @@ class DamiaoArm(Arm):
         marks = [(drive, drive.heard) for drive, _ in holding]
         transport.send_all([(drive.id, frame) for drive, frame in holding])
         transport.wait(lambda: all(drive.heard > mark for drive, mark in marks), CONFIRM_TIMEOUT_S)
-        _raise(
+        raise_problems(
             [
                 drive.error(f"did not stay enabled, its status is {status_name(drive.status)}", "check its supply")
                 for drive in self._drives
@@ -435,17 +391,6 @@ class DamiaoArm(Arm):
 def _locked(array: Vector) -> Vector:
     array.flags.writeable = False
     return array
-
-
-def _unconfirmed(marks: Sequence[tuple[Drive, int]]) -> list[Drive]:
-    return [drive for drive, mark in marks if drive.heard == mark or drive.status == Status.ENABLED]
-
-
-def _raise(problems: Sequence[DriveError]) -> None:
-    if len(problems) == 1:
-        raise problems[0]
-    if problems:
-        raise DrivesError(problems)
 
 
 def _check(robot: Robot, specs: Sequence[tuple[str, DriveProfile]]) -> None:

@@ -4,7 +4,7 @@ Positions, velocities and efforts are those of the joint; the map to the motor's
 `motor angle = scale * (joint angle - zero - fold)`, with velocity likewise, and motor torque = joint torque / scale.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from robotctl.hal.can.damiao.codec import (
@@ -65,6 +65,14 @@ class DrivesError(HardwareError):
     def __init__(self, problems: Iterable[DriveError]) -> None:
         self.problems = tuple(problems)
         super().__init__("\n".join([f"{len(self.problems)} problems with the drives", *map(str, self.problems)]))
+
+
+def raise_problems(problems: Sequence[DriveError]) -> None:
+    """Raise the one problem there is, or all of them as one; return if there is none."""
+    if len(problems) == 1:
+        raise problems[0]
+    if problems:
+        raise DrivesError(problems)
 
 
 class Drive:

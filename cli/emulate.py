@@ -1,0 +1,105 @@
+"""`robotctl emulate`: serve a robot's emulated drives to other programs."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from robotctl.hal.clock import MonotonicClock
+from robotctl.hal.robot import load_robot
+from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.orders import REGISTER_FORM, TROUBLE_FORM, order_register, order_trouble
+from robotctl.sim.motors.ports import open_port
+from robotctl.sim.motors.server import Port, Server
+
+
+def emulate(
+    robot: Annotated[str, typer.Option(help="Robot whose drives to emulate, or the path of its profile.")] = "openarm",
+    channel: Annotated[
+        str,
+        typer.Option(
+            help="Where to serve: slcan (a new pseudo-terminal), socketcan:INTERFACE, or another of python-can's."
+        ),
+    ] = "slcan",
+    adapters: Annotated[int, typer.Option(min=1, max=16, help="slcan adapters to offer, all on one bus.")] = 1,
+    classic: Annotated[
+        bool, typer.Option("--classic", help="Set the drives to classic CAN at 1 Mbit/s even where CAN FD would pass.")
+    ] = False,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="Stop after this time instead of at Ctrl-C.")] = None,
+    trouble: Annotated[list[str] | None, typer.Option(help=f"What goes wrong; repeatable. {TROUBLE_FORM}.")] = None,
+    register: Annotated[list[str] | None, typer.Option(help=f"Preset; repeatable. {REGISTER_FORM}.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of noise and trouble.")] = 0,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write channel and motors at the start, counters at the end.")
+    ] = None,
+) -> None:
+    """Serve emulated drives that speak the wire byte for byte, in real time, until Ctrl-C."""
+    loaded = load_robot(robot)
+    clock = MonotonicClock()
+    # An slcan host starts with classic CAN, and hears nothing of drives that answer in CAN FD.
+    fd = False if classic or channel == "slcan" else None
+    bench = Bench(loaded, clock.now_ns(), fd, seed)
+    port = open_port(channel, loaded, adapters)
+    if fd is None and not port.fd:
+        bench = Bench(loaded, clock.now_ns(), fd=False, seed=seed)
+    server = Server(bench, port, clock)
+    try:
+        for order in register or ():
+            order_register(bench, order)
+        for order in trouble or ():
+            order_trouble(bench, order)
+        _announce(bench, port)
+        _write(json_file, robot, bench, port, server)
+        end = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
+        server.serve(lambda: end is not None and clock.now_ns() >= end)
+        _write(json_file, robot, bench, port, server)
+    except KeyboardInterrupt:
+        _write(json_file, robot, bench, port, server)
+        raise typer.Exit(130) from None
+    finally:
+        port.close()
+
+
+def _announce(bench: Bench, port: Port) -> None:
+    table = Table(title=f"emulated drives on {port.name}")
+    for column in ("joint", "id", "reply id", "model", "answers in"):
+        table.add_column(column)
+    for drive in bench.drives:
+        answers = "CAN FD" if drive.fd else "classic CAN"
+        table.add_row(drive.name, f"0x{drive.id:02X}", f"0x{drive.reply_id:02X}", drive.model, answers)
+    console = Console()
+    console.print(table)
+    # On a line of its own and unbroken, for scripts.
+    console.print(f"channel: {port.name}", soft_wrap=True, highlight=False)
+
+
+def _write(path: Path | None, robot: str, bench: Bench, port: Port, server: Server) -> None:
+    if path is None:
+        return
+    content = {
+        "robot": robot,
+        "channel": port.name,
+        "fd": port.fd,
+        "motors": [
+            {
+                "joint": drive.name,
+                "id": drive.id,
+                "reply_id": drive.reply_id,
+                "model": drive.model,
+                "fd": drive.fd,
+                "status": drive.status,
+                "flash_cycles": drive.memory.cycles,
+            }
+            for drive in bench.drives
+        ],
+        "received": server.received,
+        "answered": server.answered,
+        "lost": server.lost,
+        "garbage": port.garbage,
+    }
+    fresh = path.with_name(path.name + ".part")
+    fresh.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    fresh.replace(path)

@@ -1,0 +1,274 @@
+"""The drives of a robot on one plant and one bus: frames in, replies out, and everything that happens in between.
+
+Time comes with every call and never goes backwards. Between two calls the physics runs in one go, unless a drive's
+own loop has to be stepped, or something falls due: a watchdog, a late reply, a command in its dead time, trouble.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from heapq import heappop, heappush
+from random import Random
+
+from robotctl.hal.can.damiao.codec import BROADCAST_ID, Offset, decode_register
+from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S, ControlMode
+from robotctl.hal.errors import ConfigError
+from robotctl.hal.profile import Drive, RobotProfile
+from robotctl.hal.robot import Robot
+from robotctl.sim.motors.damiao import FOREVER, DamiaoDrive
+from robotctl.sim.motors.memory import Memory, factory_values
+from robotctl.sim.motors.shaft import Shaft
+from robotctl.sim.motors.trouble import Reply, Trouble
+from robotctl.sim.plant import PHYSICS_STEP_NS, Plant
+
+WATCHDOG_SHARE = 0.8
+"""TIMEOUT in a drive's flash, as a fraction of the longest that the profile allows."""
+
+_STEP_S = PHYSICS_STEP_NS * 1e-9
+_WARM_NS = 100_000_000
+"""Step of the thermal models."""
+
+_Handler = Callable[[bytes, int], bytes | None]
+
+
+class Bench:
+    """All drives of a robot profile, powered up, in the plant's home pose.
+
+    `replies` fills with what the drives answer; whoever runs the bus takes it from there.
+    """
+
+    def __init__(self, robot: Robot, start_ns: int = 0, fd: bool | None = None, seed: int = 0) -> None:
+        """Build the plant and the drives.
+
+        Args:
+            robot: whose drives.
+            start_ns: the present time.
+            fd: whether the drives are set to CAN FD; None for what the profile says.
+            seed: of measurement noise and trouble.
+
+        Raises:
+            ConfigError: if the robot has no CAN drives.
+        """
+        profile = robot.profile
+        if profile.can is None:
+            raise ConfigError(f"robot {profile.name!r} has no CAN drives to emulate", "use panda or openarm")
+        self.plant = Plant(robot, start_ns)
+        self.replies: deque[Reply] = deque()
+        self.drives: list[DamiaoDrive] = []
+        self.now_ns = start_ns
+        self.trouble = Troubles(self, seed)
+        self._nominal = profile.can.bitrate
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = 0
+        self._watch_ns = FOREVER
+        self._next_ns = FOREVER
+        self._routes: dict[int, list[tuple[DamiaoDrive, _Handler]]] = {}
+        self._servos: list[DamiaoDrive] = []
+        for axis, (name, wiring, shaft) in enumerate(_shafts(profile, self.plant)):
+            mode = ControlMode.MIT if axis < robot.dof else ControlMode.POS_FORCE
+            timeout = round(WATCHDOG_SHARE * profile.safety.drive_timeout_s / TIMEOUT_UNIT_S)
+            values = factory_values(
+                wiring.motor, wiring.id, wiring.reply_id, mode, timeout, profile.can.fd if fd is None else fd
+            )
+            noise = (profile.twin.noise_position, profile.twin.noise_velocity) if axis < robot.dof else (0.0, 0.0)
+            self.drives.append(
+                DamiaoDrive(
+                    name,
+                    wiring.motor,
+                    Memory(values),
+                    shaft,
+                    self._refresh,
+                    self.at,
+                    delay_ns=round(profile.twin.delay_s * 1e9) if axis < robot.dof else 0,
+                    noise=(noise[0] * wiring.gear, noise[1] * wiring.gear),
+                    seed=seed + axis,
+                )
+            )
+        self._refresh()
+        self.at(start_ns + _WARM_NS, self._warm)
+
+    def drive(self, which: str | int) -> DamiaoDrive:
+        """Return a drive by its joint's name or by its present id.
+
+        Raises:
+            ConfigError: if there is no such drive.
+        """
+        for drive in self.drives:
+            if which in (drive.name, drive.id):
+                return drive
+        names = ", ".join(f"{drive.name} ({drive.id})" for drive in self.drives)
+        raise ConfigError(f"no motor {which!r}", f"use one of {names}")
+
+    def advance(self, to_ns: int) -> None:
+        """Let time pass until `to_ns`; everything that falls due on the way happens at its own time."""
+        while self._next_ns <= to_ns:
+            due = max(self._next_ns, self.now_ns)
+            self._run(due)
+            self.now_ns = due
+            self._happen(due)
+        if to_ns > self.now_ns:
+            self._run(to_ns)
+            self.now_ns = to_ns
+
+    def receive(self, arbitration_id: int, data: bytes) -> None:
+        """Take a data frame with an 11-bit id that a host has sent. Call `advance` first."""
+        routes = self._routes.get(arbitration_id)
+        if routes is None:
+            if arbitration_id == BROADCAST_ID:
+                self._on_register(data)
+            return
+        if self.trouble.active:
+            self._receive_troubled(routes, data)
+            return
+        now = self.now_ns
+        for drive, handler in routes:
+            reply = handler(data, now)
+            if reply is not None:
+                self.replies.append(Reply(drive.reply_id, reply, drive.fd, now))
+
+    def at(self, time_ns: int, action: Callable[[], None]) -> None:
+        """Do something at a time to come; what falls due at the same time happens in the order of these calls."""
+        self._order += 1
+        heappush(self._events, (time_ns, self._order, action))
+        self._next_ns = min(self._next_ns, time_ns)
+
+    # --- time -------------------------------------------------------------------------------------------------------
+
+    def _run(self, to_ns: int) -> None:
+        if not self._servos:
+            self.plant.advance(to_ns)
+            return
+        plant = self.plant
+        while plant.time_ns + PHYSICS_STEP_NS <= to_ns:
+            for drive in self._servos:
+                drive.servo(_STEP_S)
+            plant.advance(plant.time_ns + PHYSICS_STEP_NS)
+
+    def _happen(self, now: int) -> None:
+        while self._events and self._events[0][0] <= now:
+            heappop(self._events)[2]()
+        if self._watch_ns <= now:
+            for drive in self.drives:
+                if drive.deadline_ns <= now:
+                    drive.expire()
+            # Drives were fed since the last look, so the next deadline is known only now.
+            self._watch_ns = min(drive.deadline_ns for drive in self.drives)
+        self._next_ns = min(self._watch_ns, self._events[0][0] if self._events else FOREVER)
+
+    def _warm(self) -> None:
+        for drive in self.drives:
+            drive.warm(_WARM_NS * 1e-9)
+        self.at(self.now_ns + _WARM_NS, self._warm)
+
+    # --- frames -----------------------------------------------------------------------------------------------------
+
+    def _refresh(self) -> None:
+        """Look again at what drives may change: their ids, bit rates, modes, status and watchdogs."""
+        routes: dict[int, list[tuple[DamiaoDrive, _Handler]]] = {}
+        for drive in self.drives:
+            if self._hears(drive):
+                routes.setdefault(drive.id + Offset.MIT, []).append((drive, drive.on_mit))
+                routes.setdefault(drive.id + Offset.POS_VEL, []).append((drive, drive.on_pos_vel))
+                routes.setdefault(drive.id + Offset.VEL, []).append((drive, drive.on_vel))
+                routes.setdefault(drive.id + Offset.POS_FORCE, []).append((drive, drive.on_pos_force))
+        self._routes = routes
+        self._servos = [drive for drive in self.drives if drive.is_servoing]
+        self._watch_ns = min((drive.deadline_ns for drive in self.drives), default=FOREVER)
+        self._next_ns = min(self._watch_ns, self._events[0][0] if self._events else FOREVER)
+
+    def _hears(self, drive: DamiaoDrive) -> bool:
+        """Return whether a drive has power and its arbitration phase runs at the bus's bit rate."""
+        return drive.powered and (drive.fd or drive.bitrate == self._nominal)
+
+    def _on_register(self, data: bytes) -> None:
+        for drive in self.drives:
+            # The reply to a change of id or bit rate still goes out the old way.
+            reply_id, fd = drive.reply_id, drive.fd
+            frame = decode_register(data, drive.id)
+            if frame is None or not self._hears(drive):
+                continue
+            if self.trouble.active and not self.trouble.hears(drive):
+                continue
+            reply = drive.on_register(frame, self.now_ns)
+            if reply is not None:
+                self._answer(drive, Reply(reply_id, reply, fd, self.now_ns))
+
+    def _receive_troubled(self, routes: list[tuple[DamiaoDrive, _Handler]], data: bytes) -> None:
+        for drive, handler in routes:
+            if self.trouble.hears(drive):
+                reply = handler(data, self.now_ns)
+                if reply is not None:
+                    self._answer(drive, Reply(drive.reply_id, reply, drive.fd, self.now_ns))
+
+    def _answer(self, drive: DamiaoDrive, reply: Reply) -> None:
+        if not self.trouble.active:
+            self.replies.append(reply)
+            return
+        for altered in self.trouble.alter(drive, reply):
+            if altered.stamp_ns <= self.now_ns:
+                self.replies.append(altered)
+            else:
+                self.at(altered.stamp_ns, lambda late=altered: self.replies.append(late))  # type: ignore[misc]
+
+
+class Troubles:
+    """The trouble that a bench is in."""
+
+    def __init__(self, bench: Bench, seed: int) -> None:
+        self.active: list[Trouble] = []
+        self._bench = bench
+        self._random = Random(seed)
+
+    def add(self, trouble: Trouble) -> None:
+        """Let trouble begin at its time, or now if that has passed."""
+        self._bench.at(max(trouble.from_ns, self._bench.now_ns), lambda: self._begin(trouble))
+        # So that trouble of the present acts on the very next frame.
+        self._bench.advance(self._bench.now_ns)
+
+    def remove(self, trouble: Trouble) -> None:
+        """End trouble now. Harmless if it is over, or has not begun."""
+        if trouble in self.active:
+            self.active.remove(trouble)
+            for drive in self._meant(trouble):
+                trouble.end(drive)
+
+    def hears(self, drive: DamiaoDrive) -> bool:
+        """Return whether a frame reaches a drive."""
+        return all(trouble.hears(self._random) for trouble in self._of(drive))
+
+    def alter(self, drive: DamiaoDrive, reply: Reply) -> list[Reply]:
+        """Return what becomes of a reply."""
+        replies = [reply]
+        for trouble in self._of(drive):
+            replies = list(trouble.alter(replies, self._random))
+        return replies
+
+    def _begin(self, trouble: Trouble) -> None:
+        self.active.append(trouble)
+        for drive in self._meant(trouble):
+            trouble.begin(drive)
+        if trouble.until_ns < FOREVER:
+            self._bench.at(trouble.until_ns, lambda: self.remove(trouble))
+
+    def _of(self, drive: DamiaoDrive) -> list[Trouble]:
+        return [trouble for trouble in self.active if trouble.motor_id in (None, drive.id)]
+
+    def _meant(self, trouble: Trouble) -> list[DamiaoDrive]:
+        return [drive for drive in self._bench.drives if trouble.motor_id in (None, drive.id)]
+
+
+def _shafts(profile: RobotProfile, plant: Plant) -> list[tuple[str, Drive, Shaft]]:
+    """Return joint name, wiring and shaft of every motor, in the order of the plant's axes."""
+    found = []
+    for axis, joint in enumerate(profile.joints):
+        wiring = joint.drive
+        if wiring is not None:
+            gains = joint.gains
+            shaft = Shaft(plant, axis, wiring.sign * wiring.gear, wiring.offset, gains.kp, gains.kd)
+            found.append((joint.name, wiring, shaft))
+    gripper = profile.gripper
+    if gripper and gripper.drive:
+        finger = gripper.fingers[0]
+        scale = profile.gripper.motor_open / (finger.open - finger.closed) if profile.gripper else 1.0
+        shaft = Shaft(plant, plant.dof, scale, finger.closed, gripper.gains.kp, gripper.gains.kd)
+        found.append(("gripper", gripper.drive, shaft))
+    return found

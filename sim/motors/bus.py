@@ -1,0 +1,82 @@
+"""`emulated`: a python-can bus that ends in emulated drives, in the same process and without a thread.
+
+Time is the clock's that it was opened with: the plant stands still between two calls and catches up in the next one.
+So the same bus runs in real time and in lockstep, and the same calls at the same times give the same answers.
+"""
+
+import can
+
+from robotctl.hal.can.channel import Channel
+from robotctl.hal.clock import Clock
+from robotctl.hal.robot import Robot
+from robotctl.sim.motors.bench import Bench
+
+_POLL_NS = 1_000_000
+
+
+class EmulatedBus(can.BusABC):  # type: ignore[misc]
+    """The bus between a host and the drives of a `Bench`. Replies of CAN FD are lost unless `fd`."""
+
+    def __init__(self, bench: Bench, clock: Clock, fd: bool = True) -> None:
+        super().__init__(channel="emulated")
+        self.channel_info = "emulated drives"
+        self.bench = bench
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+        self._fd = fd
+        self._clock = clock
+        self._now = clock.now_ns
+        self._advance = bench.advance
+        self._receive = bench.receive
+        self._replies = bench.replies
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
+        """Hand a frame to the drives. Never waits.
+
+        Raises:
+            can.CanOperationError: for a CAN FD frame on a classic bus.
+        """
+        self._advance(self._now())
+        if msg.is_fd and not self._fd:
+            raise can.CanOperationError("a CAN FD frame cannot be sent on a classic bus")
+        if not (msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame):
+            self._receive(msg.arbitration_id, msg.data)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next reply, or None when none comes within `timeout` seconds of the clock; None waits for ever."""
+        self._advance(self._now())
+        message = self._pop()
+        if message is not None or timeout == 0.0:
+            return message
+        deadline = None if timeout is None else self._now() + int(timeout * 1e9)
+        while message is None:
+            now = self._now()
+            if deadline is not None and now >= deadline:
+                return None
+            self._clock.sleep_until(now + _POLL_NS if deadline is None else min(now + _POLL_NS, deadline))
+            self._advance(self._now())
+            message = self._pop()
+        return message
+
+    def _pop(self) -> can.Message | None:
+        replies = self._replies
+        while replies:
+            arbitration_id, data, fd, stamp_ns = replies.popleft()
+            if fd and not self._fd:
+                continue
+            message = can.Message(
+                stamp_ns * 1e-9, arbitration_id, False, False, False, None, len(data), data, fd, True, fd
+            )
+            if self._filters is None or self._matches_filters(message):
+                return message
+        return None
+
+
+def open_emulated(robot: Robot, clock: Clock) -> Channel:
+    """Return the emulated drives of a robot. Entry point `emulated` of the group `robotctl.channels`.
+
+    Raises:
+        ConfigError: if the robot has no CAN drives.
+    """
+    bench = Bench(robot, clock.now_ns())
+    fd = robot.profile.can is not None and robot.profile.can.fd
+    return Channel(EmulatedBus(bench, clock, fd), fd, truth=bench.plant.truth, simulated=True)

@@ -1,0 +1,102 @@
+"""Trouble and register presets as words on a command line."""
+
+from collections.abc import Callable
+
+from robotctl.hal.can.damiao.registers import REGISTERS
+from robotctl.hal.errors import ConfigError
+from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.memory import accepts
+from robotctl.sim.motors.trouble import (
+    Corrupt,
+    Deaf,
+    Delay,
+    Drop,
+    Duplicate,
+    Failure,
+    Mute,
+    PowerCut,
+    Runaway,
+    Stuck,
+    Trouble,
+)
+
+_KINDS: dict[str, tuple[type[Trouble], str, Callable[[str], float]]] = {
+    "mute": (Mute, "", float),
+    "deaf": (Deaf, "", float),
+    "drop": (Drop, "probability", float),
+    "delay": (Delay, "delay_s", float),
+    "duplicate": (Duplicate, "probability", float),
+    "corrupt": (Corrupt, "probability", float),
+    "stuck": (Stuck, "", float),
+    "runaway": (Runaway, "torque", float),
+    "powercut": (PowerCut, "", float),
+    "fault": (Failure, "status", lambda text: int(text, 0)),
+}
+"""Class, the field that VALUE sets, and how VALUE is read."""
+
+TROUBLE_FORM = (
+    "KIND:MOTOR[:VALUE][@FROM[-UNTIL]], where MOTOR is a joint's name, an id or `all`, and FROM and UNTIL are seconds "
+    f"from the start; KIND is one of {', '.join(_KINDS)}; VALUE is the probability of drop, duplicate and corrupt, the "
+    "seconds of delay, the Nm of runaway, the status code of fault"
+)
+REGISTER_FORM = "MOTOR:REGISTER=VALUE, where MOTOR is a joint's name, an id or `all`, and REGISTER a number or a name"
+
+
+def order_trouble(bench: Bench, order: str) -> None:
+    """Plant the trouble that an order asks for.
+
+    Raises:
+        ConfigError: if it does not have the form `TROUBLE_FORM`.
+    """
+    start = bench.now_ns
+    words, _, span = order.partition("@")
+    kind, *rest = words.split(":")
+    if kind not in _KINDS or len(rest) not in (1, 2):
+        raise ConfigError(f"trouble {order!r} is not understood", f"write {TROUBLE_FORM}")
+    trouble, field, read = _KINDS[kind]
+    values: dict[str, float] = {}
+    try:
+        if len(rest) == 2:
+            if not field:
+                raise ValueError(f"{kind} takes no value")
+            values[field] = read(rest[1])
+        if span:
+            begin, _, end = span.partition("-")
+            values["from_ns"] = start + round(float(begin) * 1e9)
+            if end:
+                values["until_ns"] = start + round(float(end) * 1e9)
+    except ValueError as error:
+        raise ConfigError(f"trouble {order!r}: {error}", f"write {TROUBLE_FORM}") from error
+    for motor in _motors(bench, rest[0]):
+        bench.trouble.add(trouble(motor_id=motor, **values))  # type: ignore[arg-type]
+
+
+def order_register(bench: Bench, order: str) -> None:
+    """Set a register, in RAM and flash, as an order asks for.
+
+    Raises:
+        ConfigError: if it does not have the form `REGISTER_FORM`, or no drive takes such a value.
+    """
+    motor, _, assignment = order.partition(":")
+    name, _, text = assignment.partition("=")
+    names = {info.name.lower(): register for register, info in REGISTERS.items()}
+    try:
+        register = names[name.lower()] if name.lower() in names else int(name, 0)
+        value = float(int(text, 0)) if register in REGISTERS and REGISTERS[register].integer else float(text)
+    except ValueError as error:
+        raise ConfigError(f"register {order!r} is not understood: {error}", f"write {REGISTER_FORM}") from error
+    for found in _motors(bench, motor):
+        if register not in REGISTERS or (REGISTERS[register].writable and not accepts(register, value)):
+            raise ConfigError(f"register {order!r}: no drive has that", "see the vendor's list of registers")
+        bench.drive(found).preset(register, value)
+
+
+def _motors(bench: Bench, word: str) -> list[int]:
+    if word == "all":
+        return [drive.id for drive in bench.drives]
+    if word in [drive.name for drive in bench.drives]:
+        return [bench.drive(word).id]
+    try:
+        return [bench.drive(int(word, 0)).id]
+    except ValueError:
+        return [bench.drive(word).id]

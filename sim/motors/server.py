@@ -1,0 +1,152 @@
+"""Serves emulated drives to other processes, in real time, on any channel that frames can come from."""
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import can
+
+from robotctl.hal.clock import Clock
+from robotctl.hal.errors import BusError
+from robotctl.sim.motors.bench import Bench
+
+POLL_S = 0.0005
+"""Longest wait for a frame before time is let pass."""
+
+LATE_NS = 10_000_000
+"""A round that takes longer counts as this long: the drives stand still while this process does not get to run, for
+otherwise their watchdogs would bite although the frames that feed them are waiting in a queue."""
+
+_SEND_TIMEOUT_S = 0.002
+_BATCH = 64
+_FAILURES = 200
+
+
+class Port(Protocol):
+    """Where frames come from and replies go to."""
+
+    @property
+    def name(self) -> str:
+        """What a client opens, e.g. slcan:/dev/pts/3."""
+        ...
+
+    @property
+    def fd(self) -> bool:
+        """Whether CAN FD frames pass."""
+        ...
+
+    @property
+    def garbage(self) -> int:
+        """How much came in that was no frame."""
+        ...
+
+    def receive(self, timeout_s: float) -> list[can.Message]:
+        """Return the frames that have arrived; wait for the first one, but not longer than `timeout_s`.
+
+        Raises:
+            BusError: if the channel is gone.
+        """
+        ...
+
+    def send(self, frame: can.Message) -> bool:
+        """Send a reply; return whether it left."""
+        ...
+
+    def close(self) -> None:
+        """Release the channel."""
+        ...
+
+
+class BusPort:
+    """A python-can bus as a port. Nothing that arrives ends it: only an interface that stays broken does."""
+
+    def __init__(self, name: str, bus: can.BusABC, fd: bool) -> None:
+        self.name = name
+        self.fd = fd
+        self.garbage = 0
+        self._bus = bus
+        self._failures = 0
+
+    def receive(self, timeout_s: float) -> list[can.Message]:
+        frames: list[can.Message] = []
+        while len(frames) < _BATCH:
+            try:
+                frame = self._bus.recv(0.0 if frames else timeout_s)
+            except (can.CanError, OSError, ValueError, IndexError) as error:
+                self._failed(error)
+                return frames
+            if frame is None:
+                break
+            frames.append(frame)
+        self._failures = 0
+        return frames
+
+    def send(self, frame: can.Message) -> bool:
+        try:
+            self._bus.send(frame, _SEND_TIMEOUT_S)
+        except (can.CanError, OSError, ValueError):
+            return False
+        return True
+
+    def close(self) -> None:
+        self._bus.shutdown()
+
+    def _failed(self, error: Exception) -> None:
+        self.garbage += 1
+        self._failures += 1
+        if self._failures >= _FAILURES:
+            raise BusError(f"lost {self.name}: {error}", "check that the interface exists and is up") from error
+        time.sleep(POLL_S)
+
+
+class Server:
+    """A bench behind a port. Any number of clients may share the port; all of them see every reply, as on a bus."""
+
+    def __init__(self, bench: Bench, port: Port, clock: Clock) -> None:
+        self.received = 0
+        self.answered = 0
+        self.lost = 0
+        """Replies that did not leave: CAN FD on a classic channel, or a queue that was full."""
+        self._bench = bench
+        self._port = port
+        self._clock = clock
+        self._round_ns = clock.now_ns()
+
+    def serve(self, is_over: Callable[[], bool]) -> None:
+        """Serve until `is_over()`.
+
+        Raises:
+            BusError: if the channel is gone.
+        """
+        self._round_ns = self._clock.now_ns()
+        while not is_over():
+            self.step()
+
+    def step(self) -> None:
+        """Wait for frames, let time pass, and answer."""
+        frames = self._port.receive(POLL_S)
+        now = self._clock.now_ns()
+        bench = self._bench
+        bench.advance(bench.now_ns + min(now - self._round_ns, LATE_NS))
+        self._round_ns = now
+        for frame in frames:
+            if frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id:
+                continue
+            self.received += 1
+            bench.receive(frame.arbitration_id, frame.data)
+        replies = bench.replies
+        while replies:
+            arbitration_id, data, fd, stamp_ns = replies.popleft()
+            reply = can.Message(
+                timestamp=stamp_ns * 1e-9,
+                arbitration_id=arbitration_id,
+                is_extended_id=False,
+                data=data,
+                is_fd=fd,
+                bitrate_switch=fd,
+                is_rx=False,
+            )
+            if (fd and not self._port.fd) or not self._port.send(reply):
+                self.lost += 1
+            else:
+                self.answered += 1

@@ -1,0 +1,158 @@
+"""Trouble to order, seeded and deterministic: what goes wrong with frames on the wire, and with the drives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import NamedTuple
+
+from robotctl.hal.can.damiao.codec import Status
+from robotctl.sim.motors.damiao import FOREVER, DamiaoDrive
+
+
+class Reply(NamedTuple):
+    """A frame from a drive."""
+
+    arbitration_id: int
+    data: bytes
+    fd: bool
+    stamp_ns: int
+    """When it appears on the wire."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trouble:
+    """Something that is wrong with one motor, or with all, for some time."""
+
+    motor_id: int | None = None
+    """ESC_ID; None for every motor."""
+    from_ns: int = 0
+    until_ns: int = FOREVER
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        """Act on a drive when the time comes."""
+
+    def end(self, drive: DamiaoDrive) -> None:
+        """Undo it."""
+
+    def hears(self, random: Random) -> bool:  # noqa: ARG002
+        """Return whether a frame reaches the drive."""
+        return True
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:  # noqa: ARG002
+        """Return what becomes of the drive's replies."""
+        return replies
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mute(Trouble):
+    """The motor hears and obeys, but its replies never arrive."""
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:  # noqa: ARG002
+        return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deaf(Trouble):
+    """Nothing reaches the motor."""
+
+    def hears(self, random: Random) -> bool:  # noqa: ARG002
+        return False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drop(Trouble):
+    """Frames are lost, in both directions."""
+
+    probability: float = 0.1
+
+    def hears(self, random: Random) -> bool:
+        return random.random() >= self.probability
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
+        return [reply for reply in replies if random.random() >= self.probability]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delay(Trouble):
+    """Replies come late; with jitter, also out of order."""
+
+    delay_s: float = 0.005
+    jitter_s: float = 0.0
+    """Largest additional delay."""
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
+        return [
+            reply._replace(stamp_ns=reply.stamp_ns + int((self.delay_s + self.jitter_s * random.random()) * 1e9))
+            for reply in replies
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Duplicate(Trouble):
+    """Replies come twice."""
+
+    probability: float = 1.0
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
+        return [copy for reply in replies for copy in (reply,) * (1 + (random.random() < self.probability))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corrupt(Trouble):
+    """A bit of a reply is flipped on its way, past the CRC: a broken adapter, not a noisy line."""
+
+    probability: float = 0.1
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
+        return [self._flip(reply, random) if random.random() < self.probability else reply for reply in replies]
+
+    def _flip(self, reply: Reply, random: Random) -> Reply:
+        data = bytearray(reply.data)
+        data[random.randrange(len(data))] ^= 1 << random.randrange(8)
+        return reply._replace(data=bytes(data))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stuck(Trouble):
+    """The joint has seized up."""
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        drive.shaft.jam(jammed=True)
+
+    def end(self, drive: DamiaoDrive) -> None:
+        drive.shaft.jam(jammed=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Runaway(Trouble):
+    """The drive turns with a torque of its own, whatever it is told."""
+
+    torque: float = 1.0
+    """Nm of the motor"""
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        drive.shaft.run_away(self.torque)
+
+    def end(self, drive: DamiaoDrive) -> None:
+        drive.shaft.run_away(None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PowerCut(Trouble):
+    """The supply fails; when it comes back, the drive starts from its flash, disabled."""
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        drive.power_down()
+
+    def end(self, drive: DamiaoDrive) -> None:
+        drive.power_up()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure(Trouble):
+    """The drive reports a fault and switches itself off. It can be cleared at once."""
+
+    status: int = Status.OVER_CURRENT
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        drive.fail(self.status)
