@@ -27,7 +27,10 @@ def readable_errors() -> Iterator[None]:
         yield
     except RobotctlError as error:
         console = Console(stderr=True, soft_wrap=True, highlight=False)
-        console.print(f"[bold red]error[/] {error.what}" if "[" not in error.what else f"error {error.what}", markup="[" not in error.what)
+        console.print(
+            f"[bold red]error[/] {error.what}" if "[" not in error.what else f"error {error.what}",
+            markup="[" not in error.what,
+        )
         if error.remedy:
             console.print(f"  try: {error.remedy}", markup=False)
         raise typer.Exit(Exit.BAD_INPUT if isinstance(error, ConfigError) else Exit.NO_HARDWARE) from None

@@ -32,15 +32,17 @@ def run(
     robot: Annotated[str, typer.Option(help="Name of a shipped robot, or path of a profile.")] = "panda",
     task: Annotated[str, typer.Option(help="Name of a shipped task, or path of a task file.")] = "reach",
     policy: Annotated[str, typer.Option(help=f"One of {', '.join(POLICIES)}.")] = "scripted",
-    channel: Annotated[
-        str, typer.Option(help="CAN only: emulated, virtual:NAME, socketcan:can0, slcan:DEVICE.")
-    ] = "",
+    channel: Annotated[str, typer.Option(help="CAN only: emulated, virtual:NAME, socketcan:can0, slcan:DEVICE.")] = "",
     episodes: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the targets and of random policies.")] = 0,
-    fast: Annotated[bool, typer.Option("--fast", help="Simulation in lockstep, as fast as the machine allows.")] = False,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Simulation in lockstep, as fast as the machine allows.")
+    ] = False,
     record: Annotated[Path | None, typer.Option(help="MCAP file to write; default recordings/TIME-ROBOT.mcap.")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the report here.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Override a profile key, e.g. twin.lag_s=0.02.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Override a profile key, e.g. twin.lag_s=0.02.")
+    ] = None,
 ) -> None:
     """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C stops and parks."""
     console = Console(highlight=False)
@@ -58,7 +60,9 @@ def run(
             session = ProcessSession(model, backend, channel, overrides)
             actor = ProcessActor(session, work, policy, seed, overrides)
         path = record or Path("recordings") / f"{datetime.now():%Y%m%d-%H%M%S}-{model.profile.name}-{backend}.mcap"
-        console.print(f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}")
+        console.print(
+            f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}"
+        )
         outcome, result = _run(console, session, actor, path, about, overrides, episodes, seed, work)
         _summarise(console, result)
         if json is not None:
@@ -81,7 +85,9 @@ def _run(
 ) -> tuple[Exit, dict[str, Any]]:
     def on_episode(index: int, episode: Episode) -> None:
         mark = "[green]reached[/]" if episode.success else "[yellow]missed[/] "
-        console.print(f"  episode {index + 1}  {mark}  {1e3 * episode.final_distance_m:7.1f} mm  {episode.steps:4d} steps")
+        console.print(
+            f"  episode {index + 1}  {mark}  {1e3 * episode.final_distance_m:7.1f} mm  {episode.steps:4d} steps"
+        )
 
     def on_trip(event: dict[str, Any]) -> None:
         console.print(f"  [bold red]stop[/] {event['protection']} (category {event['stop_category']})", end=": ")
@@ -96,7 +102,7 @@ def _run(
     try:
         with session, record_session(session, path, about, on_trip, overrides) as recording, actor:
             try:
-                with stop_keys(lambda: session.link.desk.ask(Verb.ESTOP)):
+                with stop_keys(session.emergency_stop):
                     outcome = run_episodes(session, actor, task, episodes, seed, on_episode)
                 status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
             except (KeyboardInterrupt, Terminated) as interruption:
@@ -122,7 +128,9 @@ def _summarise(console: Console, result: dict[str, Any]) -> None:
     if timing["tick_us"]:
         late = timing["lateness_us"]["p99"]
         console.print(f"{timing['servo_hz']:.0f} Hz servo, {timing['policy_hz']:.1f} Hz policy; ", end="")
-        console.print(f"tick p99 {timing['tick_us']['p99']:.0f} us, late p99 {late:.0f} us, {timing['overruns']} overruns")
+        console.print(
+            f"tick p99 {timing['tick_us']['p99']:.0f} us, late p99 {late:.0f} us, {timing['overruns']} overruns"
+        )
     if result["stopped"]:
         console.print("[bold red]stopped[/]", end=" ")
         console.print(result["stopped"], markup=False)

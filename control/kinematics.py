@@ -35,7 +35,9 @@ class Kinematics:
                 reference[full.joints[full.getJointId(name)].idx_q] = 0.5 * (finger.closed + finger.open)
         self.model = pin.buildReducedModel(full, [full.getJointId(name) for name in others], reference)
         if [name for name in self.model.names if name != "universe"] != names:
-            raise ConfigError(f"{robot.source}: joints must be listed in the model's order: {list(self.model.names)[1:]}")
+            raise ConfigError(
+                f"{robot.source}: joints must be listed in the model's order: {list(self.model.names)[1:]}"
+            )
         if not self.model.existFrame(profile.tool_frame):
             raise ConfigError(f"{robot.source}: tool_frame {profile.tool_frame!r} is not in the model")
         carrier = self.model.frames[self.model.getFrameId(profile.tool_frame)]

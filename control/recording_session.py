@@ -15,6 +15,7 @@ from robotctl.control.process_session import ProcessSession
 from robotctl.control.recorder import Follower, RecorderProcess
 from robotctl.control.recording import Recording
 from robotctl.control.session import Session
+from robotctl.control.shared import Board
 from robotctl.hal.errors import ConfigError
 
 
@@ -98,7 +99,7 @@ def _beside(
 @contextmanager
 def _inline(session: Session, recording: SessionRecording, about: Mapping[str, object]) -> Iterator[None]:
     with Recording.open(recording.path, session.robot, about) as file:
-        follower = Follower(session.link, file)
+        follower = Follower(Board(session.link.events, session.link.ticks), file)
         session.on_poll = follower.step
         try:
             yield

@@ -59,7 +59,9 @@ class Reference:
             effort += kinematics.friction * np.tanh(velocity / _SLOW)
         if velocity @ velocity < _SLOW**2:
             self._integrate(measured)
-        return Command(CommandMode.TRACK, self.position, velocity, np.minimum(np.maximum(effort, -self._cap), self._cap))
+        return Command(
+            CommandMode.TRACK, self.position, velocity, np.minimum(np.maximum(effort, -self._cap), self._cap)
+        )
 
     def _integrate(self, measured: Vector) -> None:
         error = self.position - measured

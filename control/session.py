@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
@@ -25,7 +26,7 @@ _OFF = (State.OFF, State.SILENT, State.READY, State.FAULT)
 _STOPPED = (State.HOLD, State.FAULT, State.READY, State.SILENT)
 
 
-class Stopped(RobotctlError):
+class Stopped(RobotctlError):  # noqa: N818 - an outcome more than an error
     """The safety supervisor stopped the arm while something was expected of it."""
 
 
@@ -188,13 +189,15 @@ class Session(ABC):
             self.request(Verb.DISARM)
             self._wait(lambda: self.state in (State.READY, State.FAULT), 10.0, "the drives did not go off")
 
+    def emergency_stop(self) -> None:
+        """Ask for an emergency stop, without waiting. May be called from any thread."""
+        self.link.desk.ask(Verb.ESTOP)
+
     def bring_to_rest(self, verb: Verb) -> None:
         """Stop with DISARM or ESTOP and wait until the drives are off, whatever the present state."""
         if self.state not in _OFF:
-            try:
+            with suppress(Stopped):  # it may be stopping harder already
                 self.request(verb)
-            except Stopped:
-                pass  # already stopping harder
             self._wait(lambda: self.state in _OFF, 10.0, "the drives did not go off")
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, complaint: str) -> None:

@@ -13,7 +13,12 @@ def percentiles_us(nanoseconds: NDArray[Any]) -> dict[str, float] | None:
     if not len(nanoseconds):
         return None
     p50, p99, p999 = (float(value) / 1e3 for value in np.percentile(nanoseconds, (50, 99, 99.9)))
-    return {"p50": round(p50, 1), "p99": round(p99, 1), "p999": round(p999, 1), "max": round(nanoseconds.max() / 1e3, 1)}
+    return {
+        "p50": round(p50, 1),
+        "p99": round(p99, 1),
+        "p999": round(p999, 1),
+        "max": round(nanoseconds.max() / 1e3, 1),
+    }
 
 
 class TickStatistics:

@@ -118,7 +118,9 @@ def _wider_than_model(joint: Joint, description: Description) -> list[str]:
     problems = []
     lower, upper = joint.position
     if lower < model.lower or upper > model.upper:
-        problems.append(f"{joint.name}: position {lower}..{upper} is wider than the model's {model.lower}..{model.upper}")
+        problems.append(
+            f"{joint.name}: position {lower}..{upper} is wider than the model's {model.lower}..{model.upper}"
+        )
     if model.velocity is not None and joint.velocity > model.velocity:
         problems.append(f"{joint.name}: velocity {joint.velocity} exceeds the model's {model.velocity}")
     if model.effort is not None and joint.torque > model.effort:
@@ -130,7 +132,9 @@ def _wider_than_model(joint: Joint, description: Description) -> list[str]:
             return problems
         gear = joint.drive.gear
         if joint.torque > motor.tmax * gear:
-            problems.append(f"{joint.name}: torque {joint.torque} exceeds the {joint.drive.motor}'s {motor.tmax * gear}")
+            problems.append(
+                f"{joint.name}: torque {joint.torque} exceeds the {joint.drive.motor}'s {motor.tmax * gear}"
+            )
         if joint.velocity > motor.vmax / gear:
             problems.append(f"{joint.name}: velocity {joint.velocity} exceeds the motor's {motor.vmax / gear}")
         reach = max(abs(bound - joint.drive.offset) for bound in joint.position) * gear

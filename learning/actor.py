@@ -8,6 +8,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
@@ -169,10 +170,8 @@ class ProcessActor(Actor):
         if process is None:
             return
         if process.stdin is not None and not process.stdin.closed:
-            try:
+            with suppress(BrokenPipeError):  # it was killed; there is nothing left to tell
                 process.stdin.close()
-            except BrokenPipeError:
-                pass  # it was killed; there is nothing left to tell
         try:
             process.wait(timeout=1.0)
         except subprocess.TimeoutExpired:
@@ -185,16 +184,19 @@ class ProcessActor(Actor):
         status = self._process.poll() if self._process else None
         if status is None:
             return ""
-        return f"the policy process was killed by signal {-status}" if status < 0 else f"the policy process ended ({status})"
+        return (
+            f"the policy process was killed by signal {-status}"
+            if status < 0
+            else f"the policy process ended ({status})"
+        )
 
     def _tell(self, request: dict[str, object]) -> None:
         if self._process is None or self._process.stdin is None:
             raise HardwareError("the policy process was not started", "use the actor as a context manager")
-        try:
+        # If it is gone, the supervisor misses its heartbeat, which is where this belongs.
+        with suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(request) + "\n")
             self._process.stdin.flush()
-        except BrokenPipeError:
-            pass  # its heartbeat is missed by the supervisor, which is where this belongs
 
     def _await_ready(self, process: subprocess.Popen[str]) -> None:
         deadline = time.monotonic() + _START_TIMEOUT_S

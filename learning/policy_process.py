@@ -47,9 +47,7 @@ class PolicyConfig:
         return json.dumps(asdict(self))
 
 
-def target_of(
-    policy: Policy, record: np.void, goal: Vector, step: int, seq: int, deadline_ns: int
-) -> JointVelocity:
+def target_of(policy: Policy, record: np.void, goal: Vector, step: int, seq: int, deadline_ns: int) -> JointVelocity:
     """Ask a policy for its velocities at a tick record, and wrap them in a target."""
     observation = Observation(record["position"], record["velocity"], record["tool"], goal, step)
     return JointVelocity(policy.act(observation), int(record["epoch"]), seq, deadline_ns)

@@ -105,7 +105,7 @@ def _may_continue(session: Session, state: State) -> bool:
         return False
     trip = session.trips[-1]
     grace_ns = session.robot.profile.safety.heartbeat_grace_s * 1e9
-    return trip["protection"] == "P10" and session.clock.now_ns() - trip["stamp_ns"] < grace_ns
+    return bool(trip["protection"] == "P10" and session.clock.now_ns() - trip["stamp_ns"] < grace_ns)
 
 
 def _reason(session: Session, actor: Actor) -> str:
@@ -164,7 +164,9 @@ def report(session: Session, outcome: Outcome, about: dict[str, Any], recording:
                 for trip in session.trips
             ],
             "violations": session.judge.violations,
-            "worst_excess": {key: round(value, 6) for key, value in session.judge.worst.items() if math.isfinite(value)},
+            "worst_excess": {
+                key: round(value, 6) for key, value in session.judge.worst.items() if math.isfinite(value)
+            },
             "judged_on": "truth" if session.judge.on_truth else "measurement",
             "clipped_ticks": session.statistics.clipped,
             "stopping_time_s": round(session.robot.stopping_time_s, 3),

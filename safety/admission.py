@@ -1,4 +1,4 @@
-"""Which of a policy's targets are let in: finite, right shape, right epoch, newer than the last, not expired (P9, P10)."""
+"""P9 and P10: which of a policy's targets are let in. Finite, right shape, right epoch, newer, not expired."""
 
 from collections import deque
 
@@ -77,9 +77,7 @@ class Admission:
 
     def _malformed_trip(self, complaint: str, now_ns: int) -> Trip:
         self._malformed.append(now_ns)
-        repeated = (
-            len(self._malformed) == _MALFORMED_TO_FAULT and now_ns - self._malformed[0] <= self._window_ns
-        )
+        repeated = len(self._malformed) == _MALFORMED_TO_FAULT and now_ns - self._malformed[0] <= self._window_ns
         category = Category.BRAKE_OFF if repeated else Category.BRAKE_HOLD
         count = f", {_MALFORMED_TO_FAULT} times within {self._window_ns / 1e9:g} s" if repeated else ""
         return Trip(Protection.MALFORMED, category, f"policy sent a malformed target: {complaint}{count}", now_ns)

@@ -107,7 +107,7 @@ ENABLED = frozenset(_MOVING)
 """States in which the drives are on."""
 
 
-class Refused(Exception):
+class Refused(Exception):  # noqa: N818 - an answer more than an error
     """An event that its state does not allow."""
 
     def __init__(self, state: State, event: Event) -> None:

@@ -4,6 +4,8 @@ All of them are asked in every tick by the supervisor and answer with a `Trip` o
 instead (velocity, acceleration, position and sphere) live in `shaper.py`; those that judge targets in `admission.py`.
 """
 
+import math
+
 import numpy as np
 
 from robotctl.hal.robot import Robot
@@ -30,10 +32,8 @@ class PositionBreach:
         joint = int(beyond.argmax())
         if not beyond[joint] > 0.0:
             return None
-        cause = (
-            f"{self._names[joint]} measured at {sample.position[joint]:.3f} rad, outside its limits; acknowledge, then retreat"
-        )
-        return Trip(Protection.POSITION, Category.BRAKE_OFF, cause, sample.stamp_ns)
+        where = f"{self._names[joint]} measured at {sample.position[joint]:.3f} rad, outside its limits"
+        return Trip(Protection.POSITION, Category.BRAKE_OFF, f"{where}; acknowledge, then retreat", sample.stamp_ns)
 
 
 class SphereBreach:
@@ -47,7 +47,7 @@ class SphereBreach:
     def outside(self, tool: Vector) -> float:
         """Return how far `tool` is outside the sphere, m; negative inside."""
         offset = tool - self._centre
-        return float(offset @ offset) ** 0.5 - self._radius
+        return math.sqrt(offset @ offset) - self._radius
 
     def check(self, tool: Vector, stamp_ns: int) -> Trip | None:
         outside = self.outside(tool)

@@ -5,6 +5,7 @@ only as fast as the distance left allows (a control barrier function of relative
 same row demands an inward speed of at least k |h|.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +40,7 @@ class BoundingSphere:
     def room(self, tool: Vector) -> float:
         """Return the distance from the point (3,) to the surface, m; negative outside."""
         offset = tool - self.centre
-        return self.radius - float(offset @ offset) ** 0.5
+        return self.radius - math.sqrt(offset @ offset)
 
     def row(self, tool: Vector, jacobian: Vector) -> Row | None:
         """Return the row at a tool point (3,) with Jacobian (3, n); None at the centre."""

@@ -57,7 +57,9 @@ class SimArm(Arm):
             self._enabled = True
             holding = self._holding()
             for axis in range(self._plant.dof):
-                self._plant.drive(axis, self._kp[axis], self._kd[axis], holding.position[axis], 0.0, holding.effort[axis])
+                self._plant.drive(
+                    axis, self._kp[axis], self._kd[axis], holding.position[axis], 0.0, holding.effort[axis]
+                )
                 self._plant.settle_lag(axis)
 
     def read(self) -> Sample:

@@ -42,7 +42,9 @@ def test_imports_run_one_way(package: str) -> None:
 
 def test_the_control_process_loads_nothing_that_draws_learns_or_logs() -> None:
     code = "import sys, robotctl.control.process; print(' '.join(sys.modules))"
-    loaded = set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
+    loaded = set(
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    )
     assert not loaded & {"torch", "foxglove", "viser", "rich", "typer", "matplotlib", "mcap", "robotctl.learning"}
 
 

@@ -29,7 +29,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         self._receive = bench.receive
         self._replies = bench.replies
 
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Hand a frame to the drives. Never waits.
 
         Raises:

@@ -34,11 +34,11 @@ class Trouble:
     def end(self, drive: DamiaoDrive) -> None:
         """Undo it."""
 
-    def hears(self, random: Random) -> bool:  # noqa: ARG002
+    def hears(self, random: Random) -> bool:
         """Return whether a frame reaches the drive."""
         return True
 
-    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:  # noqa: ARG002
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
         """Return what becomes of the drive's replies."""
         return replies
 
@@ -47,7 +47,7 @@ class Trouble:
 class Mute(Trouble):
     """The motor hears and obeys, but its replies never arrive."""
 
-    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:  # noqa: ARG002
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
         return ()
 
 
@@ -55,7 +55,7 @@ class Mute(Trouble):
 class Deaf(Trouble):
     """Nothing reaches the motor."""
 
-    def hears(self, random: Random) -> bool:  # noqa: ARG002
+    def hears(self, random: Random) -> bool:
         return False
 
 

@@ -49,7 +49,15 @@ def test_one_bad_value_drops_the_whole_target(admission: Admission, index: int, 
 
 @pytest.mark.parametrize(
     "values",
-    [np.zeros(6), np.zeros(8), np.zeros((7, 1)), np.zeros(0), np.zeros(7, np.int64), np.zeros(7, np.float32), [0.0] * 7],
+    [
+        np.zeros(6),
+        np.zeros(8),
+        np.zeros((7, 1)),
+        np.zeros(0),
+        np.zeros(7, np.int64),
+        np.zeros(7, np.float32),
+        [0.0] * 7,
+    ],
 )
 def test_wrong_shape_or_type_is_malformed(admission: Admission, values: object) -> None:
     assert admission.offer(velocity(values), 0, 0) is not None

@@ -134,7 +134,7 @@ def _check_identity(drive: Drive, expected: Expected, identity: Identity) -> lis
     counts = round(expected.timeout_s / TIMEOUT_UNIT_S)
     how = (
         f"set register {Register.TIMEOUT} (TIMEOUT, 50 us a count) of motor 0x{drive.id:02X} to at most {counts} "
-        f"({expected.timeout_s * 1e3:g} ms), and save it while the drive is disabled; `robotctl motor` does both"
+        f"({expected.timeout_s * 1e3:g} ms), and save it while the drive is disabled"
     )
     if identity.timeout_s == 0.0:
         problems.append(drive.error("drive has no watchdog: it would go on when the host dies", how))
