@@ -16,6 +16,7 @@ from robotctl.control.loop import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.recording_session import record_session
 from robotctl.control.session import LockstepSession, Session
+from robotctl.hal.profile import CLASSIC_HZ
 from robotctl.hal.robot import load_robot
 from robotctl.learning.actor import Actor, InlineActor, ProcessActor
 from robotctl.learning.policies import POLICIES
@@ -45,10 +46,14 @@ def run(
     ] = None,
 ) -> None:
     """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C stops and parks."""
-    console = Console(highlight=False)
-    overrides = set_ or []
+    console = Console(highlight=False, soft_wrap=True)
+    overrides = list(set_ or [])
     with readable_errors():
         model = load_robot(robot, overrides)
+        if channel.startswith("slcan:") and model.profile.servo_hz > CLASSIC_HZ:
+            overrides.append(f"servo_hz={CLASSIC_HZ}")
+            model = load_robot(robot, overrides)
+            console.print(f"slcan carries classic CAN only: servo rate {CLASSIC_HZ} Hz")
         work = load_task(task)
         about = {"backend": backend, "robot": model.profile.name, "task": work.name, "policy": policy, "seed": seed}
         session: Session

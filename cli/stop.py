@@ -21,7 +21,7 @@ def stop(
     json: Annotated[Path | None, typer.Option(help="Write what was stopped here.")] = None,
 ) -> None:
     """Emergency stop: brake, then drives off. Exit status 4 if nothing runs or something does not stop."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
     targets = [entry for entry in registry.running() if robot in ("", entry.robot)]
     for entry in targets:
         os.kill(entry.pid, signal.SIGUSR1)

@@ -299,6 +299,9 @@ class Loop:
         self.supervisor.handle(Event.SELFTEST)
 
     def _enable(self, now: int) -> None:
+        # Drives that come on hold with the last feed-forward they were given.
+        position = self._arm.read().position
+        self._arm.write(Command(CommandMode.TRACK, position, self._zero, self.kinematics.gravity(position)))
         try:
             self._arm.enable()
         except RobotctlError as error:

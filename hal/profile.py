@@ -8,6 +8,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+CLASSIC_HZ = 250
+"""Highest servo rate of eight drives on classic CAN at 1 Mbit/s: 2.2 ms of wire time per cycle."""
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
@@ -232,6 +235,8 @@ class RobotProfile(_Strict):
         twice = {motor for motor in ids if ids.count(motor) > 1}
         if twice:
             raise ValueError(f"drive.id: {sorted(twice)} used by more than one motor")
+        if self.can and not self.can.fd and self.servo_hz > CLASSIC_HZ:
+            raise ValueError(f"servo_hz: classic CAN carries at most {CLASSIC_HZ} Hz, not {self.servo_hz}")
         if self.can and any(joint.drive is None for joint in self.joints):
             raise ValueError("can: set, but not every joint has a drive")
         return self

@@ -81,6 +81,8 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
     (S.ARMED, E.STOP): S.STOPPING,
     (S.RUN, E.STOP): S.STOPPING,
     (S.RESET, E.STOP): S.STOPPING,
+    (S.STOPPING, E.STOP): S.STOPPING,
+    (S.HOLD, E.STOP): S.HOLD,
     **{(state, E.DISARM): S.STOPPING for state in _MOVING},
     # A trip stops from every state with enabled drives; a stop may become harder, never softer.
     **{(state, E.TRIP_HOLD): S.STOPPING for state in (S.ARMED, S.RUN, S.RESET)},

@@ -64,7 +64,9 @@ class Supervisor:
         before, self.state = self.state, after(self.state, event)
         match event:
             case Event.STOP | Event.DISARM:
-                self._raise_epoch(Category.BRAKE_HOLD if event is Event.STOP else Category.BRAKE_OFF)
+                category = Category.BRAKE_HOLD if event is Event.STOP else Category.BRAKE_OFF
+                self._raise_epoch(category if self.category is None else min(category, self.category))
+                self._was_running = False  # a heartbeat that comes back does not undo what the operator did
             case Event.ARM | Event.ACK | Event.RESET_DONE | Event.OFF_CLEAN:
                 self._raise_epoch(None)
                 if event is Event.ACK:
@@ -115,8 +117,9 @@ class Supervisor:
             self._drives.check(sample, expect_enabled=True)
             or self.feedback.check(sample, now_ns)
             or (None if self.recovery else self._position.check(sample))
-            or (None if self.recovery else self._sphere.check(tool, sample.stamp_ns))
             or self._tracking.check(sample, reference)
+            # Category 2 comes last, so that it does not hide a harder stop.
+            or (None if self.recovery else self._sphere.check(tool, sample.stamp_ns))
         )
         if trip is None and state is State.RUN:
             trip = self.admission.heartbeat(now_ns)

@@ -1,5 +1,6 @@
 """The MuJoCo backend: commands reach the plant's drives directly, without a bus."""
 
+import math
 from collections import deque
 
 import numpy as np
@@ -76,6 +77,8 @@ class SimArm(Arm):
     def write(self, command: Command) -> Sent:
         if not self._enabled:
             return Sent(command, "drives are off")
+        if not self._is_sound(command):
+            return Sent(command, "not sent: a value is not finite, or there are not as many as joints")
         if self._delay_ns:
             self._waiting.append((self._clock.now_ns() + self._delay_ns, command))
         else:
@@ -107,6 +110,14 @@ class SimArm(Arm):
         # An ideal drive's own integrator would find this effort; here the plant knows it.
         gravity = self._plant.data.qfrc_bias[: self._plant.dof].copy()
         return Command(CommandMode.TRACK, position, self._none, gravity)
+
+    def _is_sound(self, command: Command) -> bool:
+        """Return whether the plant can take a command: MuJoCo would start anew after one that is not finite."""
+        _, position, velocity, effort = command
+        if not len(position) == len(velocity) == len(effort) == self._plant.dof:
+            return False
+        # Whatever is not finite stays so in a product with itself: cheaper than asking every value.
+        return math.isfinite(position @ position + velocity @ velocity + effort @ effort)
 
     def _deliver(self, now: int) -> None:
         while self._waiting and self._waiting[0][0] <= now:

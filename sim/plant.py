@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.profile import GripperProfile, RobotProfile
@@ -18,6 +19,8 @@ from robotctl.hal.types import Truth, Vector
 PHYSICS_STEP_NS = 1_000_000
 _BRAKE_TORQUE = 500.0
 """Nm of dry friction that a closed brake adds."""
+_BRAKE_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Impedance of that friction; see MuJoCo's solver parameters."""
 
 
 class AxisState(NamedTuple):
@@ -52,24 +55,25 @@ class Plant:
         if list(self._qpos[: self.dof]) != list(range(self.dof)):
             raise ConfigError(f"{robot.source}: the arm's joints must be the first of the model")
         self._tool_site = self.model.site("robotctl_tool").id
-        self._free_friction = self.model.dof_frictionloss.copy()
-        self._friction = self._free_friction.copy()
+        self._friction = self.model.dof_frictionloss.copy()
+        self._solimp = self.model.dof_solimp.copy()
+        self._jammed = [False] * self.axes
+        # Until its drives come on, an arm lies in its cradle.
+        self._braked = [axis < self.dof for axis in range(self.axes)]
         self._largest = self.model.actuator_forcerange[:, 1].copy()
         # Views of MuJoCo's own memory: an item of a memoryview costs a tenth of an item of its arrays, and emulated
         # drives set and read one axis at a time, thousands of times a second.
-        self._bias_rows = [memoryview(self.model.actuator_biasprm[actuator]) for actuator in actuators]
-        self._friction_view = memoryview(self.model.dof_frictionloss)
-        self._ctrl_view = memoryview(self.data.ctrl)
-        self._force_view = memoryview(self.data.actuator_force)
-        self._qpos_view = memoryview(self.data.qpos)
-        self._qvel_view = memoryview(self.data.qvel)
+        self._bias_rows = [_view(self.model.actuator_biasprm[actuator]) for actuator in actuators]
+        self._ctrl_view = _view(self.data.ctrl)
+        self._force_view = _view(self.data.actuator_force)
+        self._qpos_view = _view(self.data.qpos)
+        self._qvel_view = _view(self.data.qvel)
         self._addresses = [(int(self._qpos[axis]), int(self._dofs[axis]), actuators[axis]) for axis in range(self.axes)]
         self._lagged = self.model.na > 0
         self._brakes = profile.brakes
         for axis in range(self.axes):
             self.release(axis)
-        # Until its drives come on, an arm lies in its cradle.
-        self.model.dof_frictionloss[self._dofs[: self.dof]] = _BRAKE_TORQUE
+            self._hold(axis)
         self.place(np.array(profile.rest))
 
     def place(self, position: Vector) -> None:
@@ -87,11 +91,13 @@ class Plant:
 
     def drive(self, axis: int, kp: float, kd: float, position: float, velocity: float, effort: float) -> None:
         """Set the law that an enabled drive follows from now on (joint coordinates, SI)."""
-        _, dof, actuator = self._addresses[axis]
+        actuator = self._addresses[axis][2]
         bias = self._bias_rows[axis]
         bias[1] = -kp
         bias[2] = -kd
-        self._friction_view[dof] = self._friction[dof]
+        if self._braked[axis]:
+            self._braked[axis] = False
+            self._hold(axis)
         self._ctrl_view[actuator] = kp * position + kd * velocity + effort
 
     def drive_arm(self, kp: Vector, kd: Vector, position: Vector, velocity: Vector, effort: Vector) -> None:
@@ -109,10 +115,13 @@ class Plant:
 
     def release(self, axis: int) -> None:
         """Switch the drive of an axis off: no torque; the brake, where there is one, closes."""
-        self.drive(axis, 0.0, 0.0, 0.0, 0.0, 0.0)
+        bias = self._bias_rows[axis]
+        bias[1] = bias[2] = 0.0
+        self._ctrl_view[self._addresses[axis][2]] = 0.0
         self.settle_lag(axis)
         if self._brakes and axis < self.dof:
-            self.model.dof_frictionloss[self._dofs[axis]] = _BRAKE_TORQUE
+            self._braked[axis] = True
+            self._hold(axis)
 
     def axis(self, axis: int) -> AxisState:
         """Return the true state of one axis."""
@@ -131,9 +140,8 @@ class Plant:
 
     def jam(self, axis: int, jammed: bool) -> None:
         """Let an axis seize up, or run freely again, whatever its drive does."""
-        dof = self._dofs[axis]
-        self._friction[dof] = _BRAKE_TORQUE if jammed else self._free_friction[dof]
-        self.model.dof_frictionloss[dof] = self._friction[dof]
+        self._jammed[axis] = jammed
+        self._hold(axis)
 
     def truth(self) -> Truth:
         """Return the arm's true state, as copies."""
@@ -149,6 +157,13 @@ class Plant:
         """Apply external torques (n,) to the joints, Nm, until the next call: a person, a wall, a collision."""
         self.data.qfrc_applied[self._dofs[: self.dof]] = effort
 
+    def _hold(self, axis: int) -> None:
+        dof = self._dofs[axis]
+        held = self._braked[axis] or self._jammed[axis]
+        self.model.dof_frictionloss[dof] = _BRAKE_TORQUE if held else self._friction[dof]
+        # MuJoCo's dry friction creeps: as it comes, a braked joint slides at 1 mrad/s per rad/s^2 that it keeps back.
+        self.model.dof_solimp[dof] = _BRAKE_SOLIMP if held else self._solimp[dof]
+
 
 def _build(robot: Robot) -> tuple[mujoco.MjModel, list[int]]:
     profile = robot.profile
@@ -163,6 +178,10 @@ def _build(robot: Robot) -> tuple[mujoco.MjModel, list[int]]:
         _add_drive(spec, profile.gripper.fingers[0].name, profile.gripper.force, 0.0)
     model = spec.compile()
     return model, list(range(model.nu))
+
+
+def _view(array: NDArray[np.float64]) -> "memoryview[float]":
+    return array.data.cast("B").cast("d")
 
 
 def _add_drive(spec: mujoco.MjSpec, joint: str, torque: float, lag_s: float) -> None:

@@ -168,8 +168,9 @@ class DamiaoDrive:
         # A setpoint that ran away from a blocked shaft, or an integral beyond the torque there is, would wind up.
         lead = self._bound / kp
         self._setpoint = min(max(self._setpoint + step, angle - lead), angle + lead)
-        self._integral += _INTEGRAL_RATE * kp * (self._setpoint - angle) * seconds
-        self._integral = min(max(self._integral, -self._bound), self._bound)
+        error = self._setpoint - angle
+        if abs(kp * error + self._integral) < self._bound or error * self._integral < 0.0:
+            self._integral += _INTEGRAL_RATE * kp * error * seconds
         self.shaft.drive(kp, kd, self._setpoint, step / seconds, self._integral)
 
     # --- frames -----------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ class Shaft:
     __slots__ = ("_axis", "_kd", "_kp", "_origin", "_plant", "_runaway", "_scale", "_square", "servo_gains")
 
     def __init__(self, plant: Plant, axis: int, scale: float, origin: float, kp: float, kd: float) -> None:
-        """Take an axis whose drive is off. `kp` and `kd`, in axis coordinates, are the least of its own position loop."""
+        """Take an axis whose drive is off; `kp` and `kd` are the least of its own loop, in axis coordinates."""
         self._plant = plant
         self._axis = axis
         self._scale = scale

@@ -1,0 +1,117 @@
+"""Real processes under real signals. Everything runs in a runtime folder of its own, and leaves nothing behind."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROBOTCTL = [sys.executable, "-m", "robotctl.cli.main"]
+
+
+class Run:
+    """One `robotctl run` as a child process."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.folder = folder
+        self.report_path = folder / "report.json"
+        self.environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
+        files = ["--json", str(self.report_path), "--record", str(folder / "run.mcap")]
+        self.process = subprocess.Popen(
+            [*ROBOTCTL, "run", *arguments, *files],
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def pids(self) -> dict[str, int]:
+        """Pids of the children by their part, as ps shows them."""
+        parts = {"robotctl-ctl": "control", "robotctl-policy": "policy", "robotctl-rec": "recorder"}
+        found = {}
+        for pid in _children(self.process.pid):
+            try:
+                name = Path(f"/proc/{pid}/comm").read_text().strip()
+            except OSError:
+                continue
+            if name in parts:
+                found[parts[name]] = pid
+        return found
+
+    def wait_running(self, timeout_s: float = 30.0) -> dict[str, int]:
+        """Return the pids once all three parts run and the first episode has begun."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            pids = self.pids()
+            if len(pids) == 3:
+                time.sleep(1.5)  # armed and on its way
+                return pids
+            assert self.process.poll() is None, self.process.communicate()[0]
+            time.sleep(0.02)
+        raise AssertionError("the run did not start")
+
+    def finish(self, timeout_s: float = 60.0) -> tuple[int, str, dict[str, Any]]:
+        """Return exit status, output and report."""
+        output, _ = self.process.communicate(timeout=timeout_s)
+        report = json.loads(self.report_path.read_text()) if self.report_path.exists() else {}
+        return self.process.returncode, output, report
+
+    def left_behind(self) -> list[str]:
+        """Return what is still there of a run that has ended."""
+        left = [f"process {pid}" for pid in _session(self.process.pid)]
+        left += [str(path) for path in Path("/dev/shm").glob("*robotctl*")]
+        left += [str(path) for path in self.folder.glob("robotctl-*/*.json")]
+        return left
+
+    def kill_all(self) -> None:
+        for pid in _children(self.process.pid):
+            os.kill(pid, signal.SIGKILL)
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def _session(pid: int) -> list[int]:
+    """Return the live processes whose command line is ours and whose parent was the run."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            command = (entry / "cmdline").read_bytes().decode()
+            state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            continue
+        if f'"operator": {pid}' in command or f'"parent": {pid}' in command:
+            found += [int(entry.name)] if state != "Z" else []
+    return found
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Any]:
+    runs: list[Run] = []
+
+    def begin(*arguments: str) -> Run:
+        folder = tmp_path / f"run{len(runs)}"
+        folder.mkdir()
+        runs.append(Run(folder, *arguments))
+        return runs[-1]
+
+    yield begin
+    for run in runs:
+        run.kill_all()

@@ -1,0 +1,42 @@
+"""`robotctl stop` from another terminal, and policies that misbehave, in real time."""
+
+import subprocess
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from .conftest import ROBOTCTL
+
+pytestmark = pytest.mark.realtime
+
+
+def test_stop_from_another_terminal(start: Any) -> None:
+    run = start("--policy", "random", "--episodes", "4")
+    run.wait_running()
+    stopped = subprocess.run([*ROBOTCTL, "stop"], env=run.environment, capture_output=True, text=True, check=False)
+    assert stopped.returncode == 0, stopped.stdout
+    assert "stopped panda on sim" in stopped.stdout
+    status, output, report = run.finish()
+    assert status == 3, output
+    trip = report["safety"]["trips"][0]
+    assert (trip["protection"], trip["stop_category"]) == ("P23", 1)
+    assert "robotctl stop" in trip["cause"]
+    assert report["safety"]["state"] == "FAULT"
+    again = subprocess.run([*ROBOTCTL, "stop"], env=run.environment, capture_output=True, text=True, check=False)
+    assert again.returncode == 4
+    assert "nothing is running" in again.stdout
+
+
+@pytest.mark.parametrize(("policy", "protection"), [("nan", "P9"), ("stall", "P10"), ("die", "P10")])
+@pytest.mark.parametrize("backend", ["sim", "can"])
+def test_a_treacherous_policy_is_stopped_and_recorded(start: Any, backend: str, policy: str, protection: str) -> None:
+    run = start("--backend", backend, "--policy", policy)
+    status, output, report = run.finish()
+    assert status == 3, output
+    assert report["safety"]["trips"][0]["protection"] == protection
+    assert report["safety"]["violations"] == {"position": 0, "velocity": 0, "sphere": 0}
+    assert report["stopped"].startswith(protection)
+    with open(report["black_boxes"][0], "rb") as file:
+        events = [message.data for _, channel, message in make_reader(file).iter_messages() if channel.topic == "/event"]
+    assert any(protection.encode() in event for event in events)

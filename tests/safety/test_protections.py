@@ -1,0 +1,137 @@
+"""Each protection by itself, on a grid around its threshold."""
+
+import numpy as np
+import pytest
+
+from robotctl.hal.robot import Robot, load_robot
+from robotctl.hal.types import Fault, Sample
+from robotctl.safety.protections import DriveHealth, FeedbackAge, PositionBreach, SphereBreach, TrackingError
+from robotctl.safety.trip import Category, Protection
+
+STEPS = [-1e-3, -1e-6, -1e-9, 1e-9, 1e-6, 1e-3, 1.0]
+STAMP = 7_000_000
+
+
+def sample(position, **fields):
+    zero = np.zeros(len(position))
+    stamps = fields.pop("stamps", np.full(len(position), STAMP))
+    return Sample(STAMP, position, zero, zero, stamps, **({"enabled": True} | fields))
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("side", [-1, 1])
+def test_position(robot: Robot, side, step):
+    check = PositionBreach(robot)
+    limit = robot.limits.upper if side > 0 else robot.limits.lower
+    for joint in range(robot.dof):
+        position = np.array(robot.profile.home)
+        position[joint] = limit[joint] + side * (robot.profile.safety.position_breach + step)
+        trip = check.check(sample(position))
+        assert (trip is not None) is (step > 0)
+        if trip is not None:
+            assert (trip.protection, trip.category, trip.onset_ns) == (Protection.POSITION, Category.BRAKE_OFF, STAMP)
+            assert f"{robot.profile.joints[joint].name} measured at {position[joint]:.3f} rad" in trip.cause
+
+
+def test_the_worst_joint_is_named(panda: Robot):
+    position = np.array(panda.limits.upper) + [0.0, 0.1, 0.0, 0.0, 0.3, 0.0, 0.0]
+    assert "panda_joint5" in PositionBreach(panda).check(sample(position)).cause
+
+
+def test_inside_means_the_soft_limit_itself(robot: Robot):
+    check = PositionBreach(robot)
+    assert check.inside(np.array(robot.limits.lower))
+    assert check.inside(np.array(robot.limits.upper))
+    for joint in range(robot.dof):
+        for limit, side in ((robot.limits.lower, -1), (robot.limits.upper, 1)):
+            position = np.array(limit)
+            position[joint] = np.nextafter(limit[joint], side * np.inf)
+            assert not check.inside(position)
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (0.6, 0, -0.8)])
+def test_sphere(robot: Robot, direction, step):
+    check = SphereBreach(robot)
+    sphere = robot.profile.sphere
+    tool = np.array(sphere.centre) + (sphere.radius + robot.profile.safety.sphere_breach + step) * np.array(direction)
+    assert check.outside(tool) == pytest.approx(robot.profile.safety.sphere_breach + step)
+    trip = check.check(tool, STAMP)
+    assert (trip is not None) is (step > 0)
+    if trip is not None:
+        assert (trip.protection, trip.category, trip.onset_ns) == (Protection.SPHERE, Category.BRAKE_HOLD, STAMP)
+        assert f"{1e3 * (robot.profile.safety.sphere_breach + step):.0f} mm outside" in trip.cause
+
+
+def test_the_spheres_breach_is_measured_from_the_full_radius_not_from_the_shapers(panda: Robot):
+    centre = np.array(panda.profile.sphere.centre)
+    assert SphereBreach(panda).outside(centre + [0.0, 0.0, panda.profile.sphere.radius]) == pytest.approx(0.0, abs=1e-12)
+    assert SphereBreach(panda).outside(centre) == -panda.profile.sphere.radius
+
+
+@pytest.mark.parametrize("joint", range(7))
+def test_feedback_age(panda: Robot, joint):
+    safety = panda.profile.safety
+    check = FeedbackAge(panda)
+    stop, fault = round(safety.feedback_stop_s * 1e9), round(safety.feedback_fault_s * 1e9)
+    now = 10**9
+    for age, stale, trips in [
+        (0, False, False),
+        (stop, False, False),
+        (stop + 1, True, False),
+        (fault, True, False),
+        (fault + 1, True, True),
+        (0, False, False),
+    ]:
+        stamps = np.full(7, now)
+        stamps[joint] -= age
+        trip = check.check(sample(np.zeros(7), stamps=stamps), now)
+        assert check.stale is stale
+        assert (trip is not None) is trips
+        if trip is not None:
+            assert (trip.protection, trip.category) == (Protection.FEEDBACK, Category.BRAKE_OFF)
+            assert trip.onset_ns == now - age + fault
+            assert f"{panda.profile.joints[joint].name} has not answered for 50 ms" in trip.cause
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("side", [-1, 1])
+def test_tracking(robot: Robot, side, step):
+    check = TrackingError(robot)
+    for joint in range(robot.dof):
+        reference = np.zeros(robot.dof)
+        reference[joint] = side * (robot.profile.safety.tracking_error + step)
+        trip = check.check(sample(np.zeros(robot.dof)), reference)
+        assert (trip is not None) is (step > 0)
+        if trip is not None:
+            assert (trip.protection, trip.category) == (Protection.TRACKING, Category.BRAKE_OFF)
+            assert robot.profile.joints[joint].name in trip.cause
+
+
+@pytest.mark.parametrize("key", ["position_breach", "sphere_breach", "tracking_error"])
+def test_thresholds_come_from_the_profile(key):
+    """At a distance of 0.4 all three trip by default, and none with a threshold of 0.5."""
+    for robot, trips in ((load_robot("panda"), True), (load_robot("panda", [f"safety.{key}=0.5"]), False)):
+        rest = np.array(robot.profile.home)
+        beyond = rest.copy()
+        beyond[0] = robot.limits.upper[0] + 0.4
+        outside = np.array(robot.profile.sphere.centre) + [robot.profile.sphere.radius + 0.4, 0.0, 0.0]
+        found = {
+            "position_breach": PositionBreach(robot).check(sample(beyond)),
+            "sphere_breach": SphereBreach(robot).check(outside, 0),
+            "tracking_error": TrackingError(robot).check(sample(rest), rest + 0.4),
+        }[key]
+        assert (found is not None) is trips
+
+
+def test_drive_health():
+    check = DriveHealth()
+    rest = np.zeros(7)
+    assert check.check(sample(rest), expect_enabled=True) is None
+    assert check.check(sample(rest, enabled=False), expect_enabled=False) is None
+    off = check.check(sample(rest, enabled=False), expect_enabled=True)
+    assert (off.protection, off.category) == (Protection.DRIVE, Category.BRAKE_OFF)
+    faults = (Fault("joint2", 0xD, "COMMUNICATION_LOST", "look at the cable"), Fault("joint4", 0x9, "UNDERVOLTAGE", ""))
+    for expect in (True, False):
+        trip = check.check(sample(rest, faults=faults), expect_enabled=expect)
+        assert trip.cause == "joint2: drive reports COMMUNICATION_LOST (code 0xD); look at the cable"

@@ -1,0 +1,158 @@
+"""The reset routines, led along an ideal reference and through the shaper."""
+
+import numpy as np
+import pytest
+
+from robotctl.control.kinematics import Kinematics
+from robotctl.control.limiter import VelocityLimiter
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Sample
+from robotctl.safety.routines import Goto, Retreat, Settle
+from robotctl.safety.shaper import Shaper
+from robotctl.safety.sphere import BoundingSphere
+
+
+def sample(position, velocity=None):
+    velocity = np.zeros(len(position)) if velocity is None else velocity
+    return Sample(0, position, velocity, velocity, np.zeros(len(position), np.int64), enabled=True)
+
+
+def lead(robot, kinematics, routine, start):
+    """Let a routine move the reference as the loop does; return positions, velocities and wishes until it is done."""
+    limiter, shaper, dt = VelocityLimiter(robot), Shaper(robot, kinematics), robot.period_ns * 1e-9
+    position, velocity, acceleration = np.array(start), np.zeros(robot.dof), np.zeros(robot.dof)
+    positions, velocities, wishes = [position], [velocity], []
+    for _ in range(round(routine.timeout_s / dt)):
+        wanted = routine.velocity(sample(position, velocity), position)
+        if wanted is None:
+            return np.array(positions), np.array(velocities), np.array(wishes)
+        limited = limiter.step(wanted, velocity, acceleration)
+        tool, jacobian = kinematics.tool_and_jacobian(position)
+        following = shaper.step(position, velocity, limited, tool, jacobian).velocity
+        acceleration = (following - velocity) / dt
+        position = position + 0.5 * dt * (velocity + following)
+        velocity = following
+        positions.append(position)
+        velocities.append(velocity)
+        wishes.append(wanted)
+    pytest.fail(f"{routine.name} did not arrive within {routine.timeout_s} s")
+
+
+def lead_ideally(robot, routine, start):
+    dt = robot.period_ns * 1e-9
+    position, positions, wishes = np.array(start), [np.array(start)], []
+    for _ in range(round(routine.timeout_s / dt)):
+        wanted = routine.velocity(sample(position), position)
+        if wanted is None:
+            return np.array(positions), np.array(wishes)
+        position = position + dt * wanted
+        positions.append(position)
+        wishes.append(wanted)
+    pytest.fail(f"{routine.name} did not arrive within {routine.timeout_s} s")
+
+
+@pytest.fixture
+def kinematics(robot: Robot) -> Kinematics:
+    return Kinematics(robot)
+
+
+def test_goto_arrives_within_its_caps(robot: Robot, kinematics: Kinematics):
+    home = np.array(robot.profile.home)
+    safety = robot.profile.safety
+    start = home.copy()
+    start[0] -= 0.5
+    start[-1] += 0.4
+    positions, _, wishes = lead(robot, kinematics, Goto(robot, home, "home", kinematics), start)
+    assert positions[-1] == pytest.approx(home, abs=2e-3)
+    assert (np.abs(wishes) <= safety.reset_scale * robot.limits.velocity * (1 + 1e-9)).all()
+    speeds = [
+        np.linalg.norm(kinematics.tool_and_jacobian(position)[1] @ wish)
+        for position, wish in zip(positions, wishes, strict=False)
+    ]
+    assert max(speeds) <= safety.reset_tool_speed * (1 + 1e-9)
+    # One of the two caps is in use somewhere, else neither was tested.
+    scale = (np.abs(wishes) / (safety.reset_scale * robot.limits.velocity)).max()
+    assert scale > 0.999 or max(speeds) > 0.999 * safety.reset_tool_speed
+
+
+def test_goto_leads_along_a_straight_line(panda: Robot):
+    home = np.array(panda.profile.home)
+    start = home + [0.3, 0.0, 0.1, 0.0, 0.0, 0.0, -0.2]
+    routine = Goto(panda, home, "home", Kinematics(panda))
+    wanted = routine.velocity(sample(start), start)
+    assert np.cross((home - start)[[0, 2, 6]], wanted[[0, 2, 6]]) == pytest.approx(np.zeros(3), abs=1e-12)
+    assert wanted[0] < 0.0 < wanted[6]
+
+
+@pytest.mark.parametrize(("distance", "done"), [(1.9e-3, True), (2.1e-3, False)])
+def test_goto_is_done_when_it_has_arrived(panda: Robot, distance, done):
+    home = np.array(panda.profile.home)
+    routine = Goto(panda, home, "home", Kinematics(panda))
+    position = home.copy()
+    position[4] += distance
+    assert (routine.velocity(sample(position), position) is None) is done
+
+
+def test_retreat_from_beyond_joint_limits(robot: Robot, kinematics: Kinematics):
+    safety = robot.profile.safety
+    for side, limit in ((1, robot.limits.upper), (-1, robot.limits.lower)):
+        start = np.array(robot.profile.home)
+        start[0] = limit[0] + side * 0.1
+        start[-1] = limit[-1] + side * 0.05
+        routine = Retreat(robot, kinematics)
+        routine._sphere.radius = 10.0  # the joints alone
+        positions, wishes = lead_ideally(robot, routine, start)
+        beyond = np.maximum(positions - robot.limits.upper, robot.limits.lower - positions).max(axis=1)
+        assert beyond[0] > 0.0
+        assert beyond[-1] < -safety.position_margin
+        assert (np.diff(beyond) <= 1e-12).all()
+        assert (np.abs(wishes) <= 0.1 * robot.limits.velocity * (1 + 1e-9)).all()
+
+
+def test_retreat_from_outside_the_sphere(robot: Robot, kinematics: Kinematics):
+    """Several starts up to 6 cm outside: always inwards, slowly, and to its end."""
+    rng = np.random.default_rng(2)
+    sphere = BoundingSphere(robot.profile)
+    starts = []
+    while len(starts) < 3:
+        pose = rng.uniform(robot.limits.lower + 0.2, robot.limits.upper - 0.2)
+        if -0.06 < sphere.room(kinematics.tool(pose)) < -0.02:
+            starts.append(pose)
+    for start in starts:
+        positions, velocities, wishes = lead(robot, kinematics, Retreat(robot, kinematics), start)
+        rooms = np.array([sphere.room(kinematics.tool(position)) for position in positions])
+        assert rooms[-1] > 0.0
+        assert (np.diff(rooms) >= -1e-6).all()
+        assert (np.abs(wishes) <= 0.1 * robot.limits.velocity * (1 + 1e-9)).all()
+        assert (positions >= robot.limits.lower).all()
+        assert (positions <= robot.limits.upper).all()
+        assert (np.abs(velocities) <= robot.limits.velocity).all()
+
+
+def test_retreat_through_the_shaper_from_beyond_a_joint_limit(panda: Robot):
+    """The shaper lets it in, although the start is outside what it allows."""
+    kinematics = Kinematics(panda)
+    start = np.array(panda.profile.home)
+    start[4] = panda.limits.upper[4] + 0.05
+    positions, _, _ = lead(panda, kinematics, Retreat(panda, kinematics), start)
+    assert positions[-1][4] < panda.limits.upper[4]
+    assert (np.diff(positions[:, 4]) <= 1e-12).all()
+
+
+def test_retreat_has_nothing_to_do_inside(robot: Robot, kinematics: Kinematics):
+    home = np.array(robot.profile.home)
+    assert Retreat(robot, kinematics).velocity(sample(home), home) is None
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_settle_waits_for_every_measured_joint(robot: Robot, side):
+    routine = Settle(robot)
+    still = robot.profile.safety.standstill
+    home = np.array(robot.profile.home)
+    for joint in range(robot.dof):
+        velocity = np.zeros(robot.dof)
+        velocity[joint] = side * still
+        assert not routine.velocity(sample(home, velocity), home).any()
+        velocity[joint] = side * (still - 1e-9)
+        assert routine.velocity(sample(home, velocity), home) is None
+    assert routine.timeout_s > robot.stopping_time_s

@@ -1,0 +1,517 @@
+"""The supervisor on synthetic samples: what stops the arm, what clears by itself, what stays latched."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from robotctl.hal.robot import load_robot
+from robotctl.hal.types import Fault, Sample
+from robotctl.safety.machine import ENABLED, Event, Refused, State
+from robotctl.safety.supervisor import Supervisor
+from robotctl.safety.target import Hold, JointVelocity
+from robotctl.safety.trip import Category, Protection, Trip
+
+ROBOT = load_robot("panda")
+SAFETY = ROBOT.profile.safety
+HOME = np.array(ROBOT.profile.home)
+CENTRE = np.array(ROBOT.profile.sphere.centre)
+MS = 1_000_000
+PERIOD = ROBOT.period_ns
+PATHS = {
+    State.OFF: (),
+    State.SILENT: (Event.CONNECT,),
+    State.READY: (Event.CONNECT, Event.SELFTEST),
+    State.ARMED: (Event.CONNECT, Event.SELFTEST, Event.ARM),
+    State.RUN: (Event.CONNECT, Event.SELFTEST, Event.ARM, Event.START),
+    State.RESET: (Event.CONNECT, Event.SELFTEST, Event.ARM, Event.RESET),
+    State.STOPPING: (Event.CONNECT, Event.SELFTEST, Event.ARM, Event.START, Event.STOP),
+    State.HOLD: (Event.CONNECT, Event.SELFTEST, Event.ARM, Event.START, Event.STOP, Event.STANDSTILL_HOLD),
+}
+MOVING = (State.ARMED, State.RUN, State.RESET)
+
+
+class Bench:
+    """A supervisor, and the samples and time it is shown."""
+
+    def __init__(self, state: State) -> None:
+        self.supervisor = Supervisor(ROBOT)
+        for event in PATHS[state]:
+            self.supervisor.handle(event)
+        self.supervisor.admission.renew(0)
+        self.now = 0
+        self.seq = 0
+        self.position = HOME.copy()
+        self.velocity = np.zeros(7)
+        self.reference = None
+        self.tool = CENTRE
+        self.faults = ()
+        self.enabled = True
+        self.age_ns = np.zeros(7, np.int64)
+
+    def observe(self, at_ns=None):
+        self.now = self.now + PERIOD if at_ns is None else at_ns
+        stamps = self.now - self.age_ns
+        sample = Sample(
+            self.now, self.position, self.velocity, np.zeros(7), stamps, faults=self.faults, enabled=self.enabled
+        )
+        reference = self.position if self.reference is None else self.reference
+        self.supervisor.observe(sample, self.tool, reference, self.now)
+        return self.supervisor.state
+
+    def observe_until(self, at_ns):
+        while self.now + PERIOD <= at_ns:
+            self.observe()
+
+    def offer(self, epoch=None, values=None):
+        self.seq += 1
+        epoch = self.supervisor.epoch if epoch is None else epoch
+        values = np.ones(7) if values is None else values
+        self.supervisor.offer(JointVelocity(values, epoch, self.seq, self.now + 1000 * MS), self.now)
+
+
+def a_trip(category, protection=Protection.ESTOP):
+    return Trip(protection, category, f"test of category {int(category)}", 0)
+
+
+# -- every state, every category ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("category", Category)
+@pytest.mark.parametrize("state", PATHS)
+def test_a_trip_in_every_state(state, category):
+    supervisor = Bench(state).supervisor
+    before = supervisor.epoch
+    took = supervisor.trip(a_trip(category))
+    stopped_softly = state in (State.STOPPING, State.HOLD)  # with category 2, by PATHS
+    if state in ENABLED and not (stopped_softly and category is Category.BRAKE_HOLD):
+        assert took
+        assert supervisor.state is (State.DISABLED if category is Category.CUT else State.STOPPING)
+        assert supervisor.category is category
+        assert supervisor.epoch == before + 1
+    elif state is State.READY and category is not Category.BRAKE_HOLD:
+        assert took
+        assert supervisor.state is State.FAULT
+    else:
+        assert not took
+        assert supervisor.state is state
+        assert supervisor.epoch == before
+    assert [trip.category for trip in supervisor.trips] == ([category] if took else [])
+    assert (supervisor.cause is not None) is took
+
+
+@pytest.mark.parametrize(("first", "second"), list(itertools.product(Category, repeat=2)))
+def test_of_two_trips_the_harder_counts(first, second):
+    supervisor = Bench(State.RUN).supervisor
+    assert supervisor.trip(a_trip(first, Protection.TRACKING))
+    epoch = supervisor.epoch
+    took = supervisor.trip(a_trip(second, Protection.ESTOP))
+    assert took is (second < first and first is not Category.CUT)
+    assert supervisor.category is min(first, second)
+    assert supervisor.cause.protection is (Protection.ESTOP if took else Protection.TRACKING)
+    assert supervisor.epoch == epoch + took
+    assert len(supervisor.trips) == 1 + took
+
+
+@pytest.mark.parametrize("protection", [Protection.POSITION, Protection.SPHERE])
+def test_of_simultaneous_findings_the_harder_one_stops(protection):
+    bench = Bench(State.RUN)
+    bench.tool = CENTRE + [0.0, 0.0, 2.0]  # category 2
+    bench.reference = HOME + 1.0  # category 1
+    if protection is Protection.POSITION:
+        bench.position = np.array(ROBOT.limits.upper) + 0.1
+    bench.observe()
+    assert bench.supervisor.category is Category.BRAKE_OFF
+
+
+def test_an_operators_softer_stop_does_not_soften_a_hard_one():
+    supervisor = Bench(State.RUN).supervisor
+    supervisor.trip(a_trip(Category.BRAKE_OFF))
+    supervisor.handle(Event.STOP)
+    assert supervisor.category is Category.BRAKE_OFF
+    supervisor.handle(Event.DISARM)
+    assert supervisor.category is Category.BRAKE_OFF
+
+
+# -- epochs --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("state", "event"),
+    [
+        (State.READY, Event.ARM),
+        (State.RUN, Event.STOP),
+        (State.RESET, Event.STOP),
+        (State.ARMED, Event.DISARM),
+        (State.HOLD, Event.DISARM),
+        (State.HOLD, Event.ACK),
+        (State.RESET, Event.RESET_DONE),
+    ],
+)
+def test_every_stop_and_every_entry_into_armed_raises_the_epoch(state, event):
+    supervisor = Bench(state).supervisor
+    before = supervisor.epoch
+    supervisor.handle(event)
+    assert supervisor.epoch == before + 1
+
+
+def test_starting_keeps_the_epoch_so_that_a_policy_may_be_ready_first():
+    supervisor = Bench(State.ARMED).supervisor
+    before = supervisor.epoch
+    supervisor.handle(Event.START)
+    assert supervisor.epoch == before
+
+
+def test_a_target_of_before_a_stop_never_runs_after_it():
+    bench = Bench(State.RUN)
+    old = bench.supervisor.epoch
+    bench.offer()
+    assert bench.supervisor.admitted(bench.now) is not None
+    for event in (Event.STOP, Event.STANDSTILL_HOLD, Event.ACK, Event.START):
+        bench.supervisor.handle(event)
+        bench.offer(epoch=old)
+    bench.supervisor.admission.renew(bench.now)
+    assert bench.supervisor.admitted(bench.now) is None
+    refused = bench.supervisor.admission.refused
+    bench.offer(epoch=old)
+    assert bench.supervisor.admission.refused == refused + 1
+    bench.offer()
+    assert bench.supervisor.admitted(bench.now) is not None
+
+
+@pytest.mark.parametrize("state", [s for s in PATHS if s not in (State.RUN, State.STOPPING, State.HOLD)])
+def test_nobody_listens_to_a_policy_that_was_not_started(state):
+    bench = Bench(state)
+    bench.offer(values=np.full(7, np.nan))
+    assert bench.supervisor.state is state
+    assert bench.supervisor.trips == []
+    bench.offer()
+    assert bench.supervisor.admission.seq == -1
+
+
+@pytest.mark.parametrize("state", [s for s in PATHS if s is not State.RUN])
+def test_a_target_moves_the_arm_in_run_only(state):
+    bench = Bench(state)
+    bench.offer()
+    assert bench.supervisor.admitted(bench.now) is None
+
+
+def test_hold_is_admitted_as_no_motion():
+    bench = Bench(State.RUN)
+    bench.supervisor.offer(Hold(bench.supervisor.epoch, 1, 1000 * MS), 0)
+    assert bench.supervisor.admitted(0) is None
+    assert bench.observe(99 * MS) is State.RUN
+
+
+# -- P3, P5, P12, P17, P24 -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("state", [s for s in PATHS if s not in ENABLED])
+def test_with_the_drives_off_nothing_is_judged(state):
+    bench = Bench(state)
+    bench.position = np.array(ROBOT.limits.upper) + 1.0
+    bench.enabled = False
+    assert bench.observe() is state
+    assert bench.supervisor.trips == []
+
+
+@pytest.mark.parametrize("state", ENABLED)
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("joint", range(7))
+def test_p3_position(state, side, joint):
+    limit = (ROBOT.limits.upper if side > 0 else ROBOT.limits.lower)[joint]
+    for beyond, trips in ((SAFETY.position_breach - 1e-6, False), (SAFETY.position_breach + 1e-6, True)):
+        bench = Bench(state)
+        bench.position[joint] = limit + side * beyond
+        bench.observe(MS)
+        assert bool(bench.supervisor.trips) is trips
+        if trips:
+            trip = bench.supervisor.trips[0]
+            assert (trip.protection, trip.category) == (Protection.POSITION, Category.BRAKE_OFF)
+            assert ROBOT.profile.joints[joint].name in trip.cause
+
+
+@pytest.mark.parametrize("state", MOVING)
+def test_p5_sphere(state):
+    direction = np.array([0.6, 0.0, 0.8])
+    reach = ROBOT.profile.sphere.radius + SAFETY.sphere_breach
+    for distance, trips in ((reach - 1e-6, False), (reach + 1e-6, True)):
+        bench = Bench(state)
+        bench.tool = CENTRE + distance * direction
+        bench.observe(MS)
+        found = [(trip.protection, trip.category) for trip in bench.supervisor.trips]
+        assert found == ([(Protection.SPHERE, Category.BRAKE_HOLD)] if trips else [])
+
+
+@pytest.mark.parametrize("state", ENABLED)
+@pytest.mark.parametrize("joint", range(7))
+def test_p12_feedback(state, joint):
+    oldest = round(SAFETY.feedback_fault_s * 1e9)
+    for age, trips in ((oldest, False), (oldest + 1, True)):
+        bench = Bench(state)
+        bench.age_ns[joint] = age
+        bench.observe(80 * MS)
+        found = [(trip.protection, trip.category) for trip in bench.supervisor.trips]
+        assert found == ([(Protection.FEEDBACK, Category.BRAKE_OFF)] if trips else [])
+        if trips:
+            assert bench.supervisor.trips[0].onset_ns == bench.now - 1
+            assert ROBOT.profile.joints[joint].name in bench.supervisor.trips[0].cause
+
+
+def test_stale_feedback_takes_the_target_away_and_gives_it_back():
+    bench = Bench(State.RUN)
+    bench.offer()
+    limit = round(SAFETY.feedback_stop_s * 1e9)
+    for age, admitted in ((limit, True), (limit + 1, False), (0, True)):
+        bench.age_ns[3] = age
+        bench.observe()
+        assert (bench.supervisor.admitted(bench.now) is not None) is admitted
+        assert bench.supervisor.state is State.RUN
+
+
+@pytest.mark.parametrize("state", ENABLED)
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("joint", range(7))
+def test_p17_tracking(state, side, joint):
+    for error, trips in ((SAFETY.tracking_error - 1e-9, False), (SAFETY.tracking_error + 1e-9, True)):
+        bench = Bench(state)
+        bench.reference = HOME.copy()
+        bench.reference[joint] += side * error
+        bench.observe(MS)
+        found = [(trip.protection, trip.category) for trip in bench.supervisor.trips]
+        assert found == ([(Protection.TRACKING, Category.BRAKE_OFF)] if trips else [])
+
+
+@pytest.mark.parametrize("state", ENABLED)
+def test_p24_a_faulty_drive(state):
+    bench = Bench(state)
+    bench.faults = (Fault("panda_joint3", 0xB, "OVER_TEMPERATURE", "let it cool down"),)
+    bench.observe()
+    (trip,) = bench.supervisor.trips
+    assert (trip.protection, trip.category) == (Protection.DRIVE, Category.BRAKE_OFF)
+    assert "panda_joint3" in trip.cause
+    assert "OVER_TEMPERATURE" in trip.cause
+    assert "let it cool down" in trip.cause
+
+
+@pytest.mark.parametrize("state", ENABLED)
+def test_p24_a_drive_that_went_off(state):
+    bench = Bench(state)
+    bench.enabled = False
+    bench.observe()
+    assert [trip.protection for trip in bench.supervisor.trips] == [Protection.DRIVE]
+
+
+def test_a_position_that_is_not_a_number_does_not_pass_for_healthy():
+    bench = Bench(State.RUN)
+    bench.position[2] = np.nan
+    bench.age_ns[2] = 10**12  # what a joint that was never heard of looks like
+    bench.observe()
+    assert bench.supervisor.cause.protection is Protection.FEEDBACK
+
+
+# -- standstill ----------------------------------------------------------------------------------------------------
+
+
+def test_standstill_takes_five_quiet_ticks_in_a_row():
+    bench = Bench(State.STOPPING)
+    for quiet in (4, 4, 5):
+        bench.velocity[:] = SAFETY.standstill + 1e-6
+        assert bench.observe() is State.STOPPING
+        bench.velocity[:] = SAFETY.standstill - 1e-6
+        for _ in range(quiet - 1):
+            assert bench.observe() is State.STOPPING
+        state = bench.observe()
+        assert state is (State.HOLD if quiet == 5 else State.STOPPING)
+
+
+def test_one_joint_that_moves_is_not_standstill():
+    bench = Bench(State.STOPPING)
+    bench.velocity[6] = -SAFETY.standstill
+    for _ in range(20):
+        assert bench.observe() is State.STOPPING
+
+
+@pytest.mark.parametrize(
+    ("category", "state"), [(Category.BRAKE_HOLD, State.HOLD), (Category.BRAKE_OFF, State.DISABLED)]
+)
+def test_a_stop_that_never_comes_to_rest_ends_anyway(category, state):
+    bench = Bench(State.RUN)
+    bench.velocity[:] = 1.0
+    bench.supervisor.trip(a_trip(category))
+    limit = round((ROBOT.stopping_time_s + 0.5) * 1e9)
+    bench.observe()
+    began = bench.now
+    bench.observe_until(began + limit)
+    assert bench.supervisor.state is State.STOPPING
+    assert bench.observe() is state
+
+
+def test_the_time_a_stop_may_take_begins_anew_with_the_next_stop():
+    bench = Bench(State.STOPPING)
+    bench.velocity[:] = 1.0
+    bench.observe_until(500 * MS)
+    bench.velocity[:] = 0.0
+    bench.observe_until(520 * MS)
+    for event in (Event.ACK, Event.START):
+        bench.supervisor.handle(event)
+    bench.supervisor.admission.renew(bench.now)
+    bench.observe_until(600 * MS)
+    bench.velocity[:] = 1.0
+    bench.supervisor.handle(Event.STOP)
+    bench.observe_until(600 * MS + round((ROBOT.stopping_time_s + 0.4) * 1e9))
+    assert bench.supervisor.state is State.STOPPING
+
+
+# -- the heartbeat -------------------------------------------------------------------------------------------------
+
+
+def silent_run():
+    """A policy that fell silent at 0; the stop began at 100 ms."""
+    bench = Bench(State.RUN)
+    bench.observe_until(100 * MS - PERIOD)
+    assert bench.supervisor.state is State.RUN
+    bench.observe()
+    assert bench.supervisor.state is State.STOPPING
+    assert bench.supervisor.cause.protection is Protection.HEARTBEAT
+    return bench
+
+
+def test_a_heartbeat_back_within_the_grace_resumes_with_new_targets_only():
+    bench = silent_run()
+    bench.offer(epoch=bench.supervisor.epoch - 1)
+    bench.observe_until(590 * MS)
+    assert bench.supervisor.state is State.HOLD
+    bench.offer()
+    assert bench.observe() is State.RUN
+    assert bench.supervisor.cause is None
+    assert bench.supervisor.category is None
+    assert bench.supervisor.admitted(bench.now) is not None
+    assert len(bench.supervisor.trips) == 1
+
+
+@pytest.mark.parametrize(("at_ms", "resumes"), [(600, True), (602, False), (2000, False)])
+def test_the_grace_ends_500_ms_after_the_heartbeat_was_missed(at_ms, resumes):
+    bench = silent_run()
+    bench.observe_until(at_ms * MS - PERIOD)
+    bench.offer()
+    bench.observe()
+    assert bench.supervisor.state is (State.RUN if resumes else State.HOLD)
+
+
+def test_after_the_grace_only_the_operator_resumes():
+    bench = silent_run()
+    bench.observe_until(700 * MS)
+    for _ in range(20):
+        bench.offer()
+        assert bench.observe() is State.HOLD
+    bench.supervisor.handle(Event.ACK)
+    assert bench.supervisor.state is State.ARMED
+    assert not bench.supervisor.recovery
+    bench.supervisor.handle(Event.START)
+
+
+@pytest.mark.parametrize(
+    ("event", "end"), [(Event.STOP, State.HOLD), (Event.DISARM, State.DISABLED)], ids=["stop", "disarm"]
+)
+@pytest.mark.parametrize("wait_ms", [102, 300], ids=["stopping", "holding"])
+def test_an_operators_stop_is_not_undone_by_the_heartbeats_return(event, end, wait_ms):
+    bench = silent_run()
+    bench.observe_until(wait_ms * MS)
+    bench.supervisor.handle(event)
+    for _ in range(20):
+        bench.offer()
+        bench.observe()
+        if bench.supervisor.state is end:
+            break
+        assert bench.supervisor.state is not State.RUN
+    assert bench.supervisor.state is end
+
+
+def test_a_harder_stop_is_not_undone_by_the_heartbeats_return():
+    bench = silent_run()
+    bench.supervisor.trip(a_trip(Category.BRAKE_OFF))
+    bench.offer()
+    bench.observe_until(200 * MS)
+    assert bench.supervisor.state is State.DISABLED
+
+
+@pytest.mark.parametrize("state", [State.ARMED, State.RESET])
+def test_no_policy_is_missed_before_it_was_started(state):
+    bench = Bench(state)
+    bench.observe_until(1000 * MS)
+    assert bench.supervisor.state is state
+    assert bench.supervisor.trips == []
+
+
+def test_a_malformed_target_stops_at_once_and_three_end_in_a_fault():
+    bench = Bench(State.RUN)
+    bench.offer(values=np.full(7, np.nan))
+    assert (bench.supervisor.state, bench.supervisor.category) == (State.STOPPING, Category.BRAKE_HOLD)
+    bench.offer(values=np.full(7, np.nan))
+    bench.offer()  # a good one does not clear it
+    bench.observe()
+    assert (bench.supervisor.state, bench.supervisor.category) == (State.STOPPING, Category.BRAKE_HOLD)
+    bench.offer(values=np.zeros(6))
+    assert (bench.supervisor.state, bench.supervisor.category) == (State.STOPPING, Category.BRAKE_OFF)
+    assert bench.supervisor.cause.protection is Protection.MALFORMED
+
+
+# -- recovery ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("protection", "recovers"),
+    [(p, p in (Protection.POSITION, Protection.SPHERE)) for p in Protection],
+    ids=[p.name for p in Protection],
+)
+def test_acknowledging_a_breach_permits_only_the_retreat(protection, recovers):
+    supervisor = Bench(State.RUN).supervisor
+    supervisor.trip(a_trip(Category.BRAKE_HOLD, protection))
+    supervisor.handle(Event.STANDSTILL_HOLD)
+    supervisor.handle(Event.ACK)
+    assert supervisor.recovery is recovers
+    supervisor.handle(Event.RESET)
+    assert supervisor.recovery is recovers
+    supervisor.handle(Event.RESET_DONE)
+    assert not supervisor.recovery
+
+
+def test_recovery_survives_the_way_through_a_fault():
+    supervisor = Bench(State.RUN).supervisor
+    supervisor.trip(a_trip(Category.BRAKE_OFF, Protection.POSITION))
+    for event in (Event.STANDSTILL_OFF, Event.OFF_FAULT, Event.ACK, Event.SELFTEST, Event.ARM):
+        supervisor.handle(event)
+    assert supervisor.recovery
+
+
+def test_in_recovery_the_breach_itself_does_not_trip_again_but_everything_else_does():
+    bench = Bench(State.RESET)
+    bench.supervisor.recovery = True
+    bench.tool = CENTRE + [0.0, 0.0, 2.0]
+    bench.position[0] = ROBOT.limits.upper[0] + 0.5
+    assert bench.observe() is State.RESET
+    bench.reference = bench.position + 1.0
+    assert bench.observe() is State.STOPPING
+
+
+@pytest.mark.parametrize(
+    ("beyond", "tool_out", "recovers"),
+    [(-1e-9, -1e-9, False), (1e-9, -1e-9, True), (-1e-9, 1e-9, True)],
+)
+def test_arming_outside_a_limit_begins_the_recovery(beyond, tool_out, recovers):
+    bench = Bench(State.ARMED)
+    position = HOME.copy()
+    position[1] = ROBOT.limits.lower[1] - beyond
+    tool = CENTRE + [ROBOT.profile.sphere.radius + tool_out, 0.0, 0.0]
+    none = np.zeros(7)
+    bench.supervisor.begin_recovery_if_outside(Sample(0, position, none, none, np.zeros(7, np.int64)), tool)
+    assert bench.supervisor.recovery is recovers
+
+
+def test_a_refused_event_changes_nothing():
+    supervisor = Bench(State.READY).supervisor
+    before = supervisor.epoch
+    with pytest.raises(Refused):
+        supervisor.handle(Event.START)
+    assert (supervisor.state, supervisor.epoch) == (State.READY, before)
