@@ -4,8 +4,8 @@ import can
 import pytest
 
 from robotctl.hal.can.channel import open_channel
-from robotctl.hal.can.damiao.codec import Special, encode_mit, encode_special
 from robotctl.hal.can.damiao.codec import MitCommand as Mit
+from robotctl.hal.can.damiao.codec import Special, encode_mit, encode_special
 from robotctl.hal.clock import MonotonicClock, VirtualClock
 from robotctl.hal.errors import BusError, ConfigError
 from robotctl.hal.robot import Robot, load_robot

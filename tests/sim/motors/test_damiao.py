@@ -86,7 +86,7 @@ def host() -> Host:
     return Host()
 
 
-# --- feedback -----------------------------------------------------------------------------------------------------------
+# --- feedback ---------------------------------------------------------------------------------------------------------
 
 
 def test_every_drive_starts_disabled_and_answers(host: Host) -> None:
@@ -154,7 +154,7 @@ def test_no_frame_breaks_a_bench(frames: list) -> None:
         host.bench.receive(identifier, data)
 
 
-# --- enable, modes, laws ------------------------------------------------------------------------------------------------
+# --- enable, modes, laws ----------------------------------------------------------------------------------------------
 
 
 def test_commands_before_enabling_do_nothing(host: Host) -> None:
@@ -281,7 +281,7 @@ def test_gripper_closes_with_limited_force(host: Host) -> None:
         assert feedback.position == pytest.approx(target, abs=0.05)
 
 
-# --- watchdog and faults ------------------------------------------------------------------------------------------------
+# --- watchdog and faults ----------------------------------------------------------------------------------------------
 
 
 def test_watchdog_bites_after_its_time_and_not_before(host: Host) -> None:
@@ -367,7 +367,7 @@ def test_it_gets_warm_and_switches_itself_off(host: Host) -> None:
     assert host.refresh(GRIPPER).status == Status.ROTOR_OVER_TEMPERATURE
 
 
-# --- registers ----------------------------------------------------------------------------------------------------------
+# --- registers --------------------------------------------------------------------------------------------------------
 
 
 def test_every_register_can_be_read(host: Host) -> None:
@@ -449,7 +449,7 @@ def test_a_stored_rate_above_5m_falls_back_at_power_up(host: Host) -> None:
     assert host.read(Register.CAN_BR) == 4
 
 
-# --- zero and wake-up ---------------------------------------------------------------------------------------------------
+# --- zero and wake-up -------------------------------------------------------------------------------------------------
 
 
 def test_zero_is_here_and_stays_over_power(host: Host) -> None:
@@ -495,7 +495,7 @@ def test_the_law_holds_where_it_woke() -> None:
     assert host.refresh(GRIPPER).position == pytest.approx(folded, abs=0.01)
 
 
-# --- imperfections of the profile ---------------------------------------------------------------------------------------
+# --- imperfections of the profile -------------------------------------------------------------------------------------
 
 
 def test_dead_time_holds_motion_commands_back() -> None:

@@ -65,6 +65,6 @@ def test_unknown_registers_read_as_float_and_cannot_be_written() -> None:
 
 
 def test_units() -> None:
-    assert 1600 * TIMEOUT_UNIT_S == pytest.approx(0.08)
+    assert pytest.approx(0.08) == 1600 * TIMEOUT_UNIT_S
     assert CAN_BITRATES[4] == 1_000_000
     assert CAN_BITRATES[9] == 5_000_000
