@@ -1,6 +1,6 @@
 """`robotctl emulate`: serve a robot's emulated drives to other programs."""
 
-import json
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from robotctl.cli.errors import Exit, readable_errors
+from robotctl.cli.output import write_json
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.robot import load_robot
 from robotctl.sim.motors.bench import Bench
@@ -32,35 +34,33 @@ def emulate(
     trouble: Annotated[list[str] | None, typer.Option(help=f"What goes wrong; repeatable. {TROUBLE_FORM}.")] = None,
     register: Annotated[list[str] | None, typer.Option(help=f"Preset; repeatable. {REGISTER_FORM}.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of noise and trouble.")] = 0,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write channel and motors at the start, counters at the end.")
+    json: Annotated[
+        Path | None, typer.Option(help="Write channel and motors at the start, counters at the end.")
     ] = None,
 ) -> None:
-    """Serve emulated drives that speak the wire byte for byte, in real time, until Ctrl-C."""
-    loaded = load_robot(robot)
-    clock = MonotonicClock()
-    # An slcan host starts with classic CAN, and hears nothing of drives that answer in CAN FD.
-    fd = False if classic or channel == "slcan" else None
-    bench = Bench(loaded, clock.now_ns(), fd, seed)
-    port = open_port(channel, loaded, adapters)
-    if fd is None and not port.fd:
-        bench = Bench(loaded, clock.now_ns(), fd=False, seed=seed)
-    server = Server(bench, port, clock)
-    try:
-        for order in register or ():
-            order_register(bench, order)
-        for order in trouble or ():
-            order_trouble(bench, order)
-        _announce(bench, port)
-        _write(json_file, robot, bench, port, server)
-        end = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
-        server.serve(lambda: end is not None and clock.now_ns() >= end)
-        _write(json_file, robot, bench, port, server)
-    except KeyboardInterrupt:
-        _write(json_file, robot, bench, port, server)
-        raise typer.Exit(130) from None
-    finally:
-        port.close()
+    """Serve emulated drives that speak the wire byte for byte, in real time, until Ctrl-C (exit status 130)."""
+    with readable_errors():
+        clock = MonotonicClock()
+        loaded = load_robot(robot)
+        with closing(open_port(channel, loaded, adapters)) as port:
+            # The host of an slcan adapter starts with classic CAN, and hears nothing of drives that answer in CAN FD.
+            bench = Bench(loaded, clock.now_ns(), fd=port.fd and not classic, seed=seed)
+            for order in register or ():
+                order_register(bench, order)
+            for order in trouble or ():
+                order_trouble(bench, order)
+            server = Server(bench, port, clock)
+            _announce(bench, port)
+            _write(json, robot, bench, port, server)
+            end = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
+            interrupted = False
+            try:
+                server.serve(lambda: end is not None and clock.now_ns() >= end)
+            except KeyboardInterrupt:
+                interrupted = True
+            _write(json, robot, bench, port, server)
+    if interrupted:
+        raise typer.Exit(Exit.INTERRUPTED)
 
 
 def _announce(bench: Bench, port: Port) -> None:
@@ -101,5 +101,6 @@ def _write(path: Path | None, robot: str, bench: Bench, port: Port, server: Serv
         "garbage": port.garbage,
     }
     fresh = path.with_name(path.name + ".part")
-    fresh.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    # Replaced in one go, since others wait for this file to appear.
+    write_json(fresh, content)
     fresh.replace(path)

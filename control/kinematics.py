@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Vector
+from robotctl.hal.types import Vector, frozen
 
 
 class Kinematics:
@@ -46,11 +46,10 @@ class Kinematics:
         self._tool = self.model.addFrame(tool)
         self._data = self.model.createData()
         self._aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        self.reach = float(
-            sum(np.linalg.norm(joint.translation) for joint in list(self.model.jointPlacements)[2:])
-            + np.linalg.norm(placement.translation)
-        )
-        """Length of the chain from the first joint to the tool point, m: no joint is further from it."""
+        links = [float(np.linalg.norm(joint.translation)) for joint in list(self.model.jointPlacements)[2:]]
+        links.append(float(np.linalg.norm(placement.translation)))
+        self.reach = frozen(np.cumsum(links[::-1])[::-1])
+        """Length of the chain from each joint to the tool point (n,), m: no joint is further from it."""
         self.damping = np.array(self.model.damping)
         """Viscous friction of each joint, Nms/rad."""
         self.friction = np.array(self.model.friction)

@@ -47,6 +47,9 @@ class Verb(IntEnum):
     CLOSE = 11
 
 
+_VERBS = frozenset(Verb)
+
+
 class Loop:
     """The control of one arm. `link` is where targets and requests come from and ticks and events go to."""
 
@@ -123,7 +126,8 @@ class Loop:
         now = self._clock.now_ns()
         supervisor = self.supervisor
         if self._estop:
-            self._serve_estop(now)
+            source, self._estop = self._estop, ""
+            self._serve_estop(source, now)
         request = self._link.desk.pending()
         if request is not None:
             self._serve(*request, now)
@@ -219,11 +223,16 @@ class Loop:
                 return
         self._damping = False
         self._lowering_ns = None
-        self._arm.disable()
-        if self._closing:
-            self._close(now)
+        try:
+            self._arm.disable()
+        except RobotctlError as error:
+            # A drive that does not confirm keeps the arm from READY, but must not end the supervision of the others.
+            clean = False
+            self._link.events.write({"type": "log", "stamp_ns": now, "text": str(error)})
         if self.supervisor.state is State.DISABLED:
             self.supervisor.handle(Event.OFF_CLEAN if clean else Event.OFF_FAULT)
+        if self._closing:
+            self._close(now)
 
     def _routine_velocity(self, sample: Sample, now: int) -> Vector:
         routine = self._routine
@@ -246,6 +255,8 @@ class Loop:
         """Carry out one request and answer it. A refused request changes nothing."""
         text = ""
         try:
+            if verb not in _VERBS:
+                raise RobotctlError(f"there is no verb {verb}")
             self._carry_out(Verb(verb), now)
         except (Refused, RobotctlError) as error:
             text = str(error)
@@ -283,7 +294,7 @@ class Loop:
                 else:
                     self._reference.resync(self._reference.position, self._reference.velocity)
             case Verb.ESTOP:
-                self.estop("the operator")
+                self._serve_estop("the operator", now)
             case Verb.CLOSE:
                 self._close(now)
 
@@ -320,9 +331,8 @@ class Loop:
             self.supervisor.handle(Event.CLOSE)
             self.shut_down()
 
-    def _serve_estop(self, now: int) -> None:
-        cause = f"emergency stop by {self._estop}; release it, then acknowledge"
-        self._estop = ""
+    def _serve_estop(self, source: str, now: int) -> None:
+        cause = f"emergency stop by {source}; release it, then acknowledge"
         self.supervisor.trip(Trip(Protection.ESTOP, Category.BRAKE_OFF, cause, now))
 
     # -- publishing -----------------------------------------------------------------------------------------------

@@ -28,12 +28,16 @@ _SOLVED = (1, 2)
 """daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
 
 
+_SAMPLES = np.array([[1.0], [0.75], [0.5], [0.25]])
+"""Where along the time to rest a predicted stop is looked at; the end first, since it fails first."""
+
+
 class ToolModel(Protocol):
     """What the shaper has to know of the arm's geometry."""
 
     @property
-    def reach(self) -> float:
-        """A bound on the distance between the tool point and any joint's axis, m."""
+    def reach(self) -> Vector:
+        """A bound on the distance between the tool point and each joint's axis (n,), m."""
         ...
 
     def tool(self, position: Vector) -> Vector:
@@ -86,9 +90,10 @@ class Shaper:
         self._step = self.acceleration_cap * self._dt
         # A hair wider, so that the limiter's own full acceleration does not count as clipped for a rounding error.
         self._change = self._step * (1.0 + 1e-9)
-        # Bounds on how fast, and how far until it rests, the tool can move per unit of joint speed.
-        self._speed_reach = np.full(self._n, model.reach)
-        self._travel_reach = model.reach * (self._dt + self.velocity_cap / (2.0 * self.acceleration_cap))
+        # With these, speed @ reach bounds the tool's speed, and speed @ (step + braking * speed) its way to rest.
+        self._reach = model.reach
+        self._reach_step = model.reach * self._dt
+        self._reach_braking = model.reach / (2.0 * self.acceleration_cap)
         self._hessian = np.eye(self._n)
         # Where braking within the acceleration caps cannot keep the row, the row gives way, not the caps.
         self._firm = np.zeros(self._n + 1, dtype=np.int32)
@@ -115,13 +120,14 @@ class Shaper:
             clip = Clip.POSITION if (np.abs(wanted) <= self.velocity_cap).all() else Clip.VELOCITY
         speed = np.abs(best)
         room = self.sphere.room(tool)
-        if self.sphere.gain * room < float(self._speed_reach @ speed):
+        if self.sphere.gain * room < speed @ self._reach:
             row = self.sphere.row(tool, jacobian)
             if row is not None and float(row.normal @ best) > row.bound:
                 clip |= Clip.SPHERE
                 best = self._into_sphere(best, wanted, lower, upper, row, tool, jacobian)
                 speed = np.abs(best)
-        if room < float(self._travel_reach @ speed) and not self._stops_inside(position, velocity, best, tool):
+        way = speed @ (self._reach_step + self._reach_braking * speed)
+        if room < way and not self._stops_inside(position, velocity, best, tool):
             clip |= Clip.PREDICTED_STOP
             best = self.brake(velocity)
         return Shaped(best, clip)
@@ -170,11 +176,16 @@ class Shaper:
         return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
 
     def _stops_inside(self, position: Vector, velocity: Vector, following: Vector, tool: Vector) -> bool:
-        """Return whether braking from `following` ends inside the sphere or, already outside, no further out."""
-        braking = 0.5 * np.abs(following) * following / self.acceleration_cap
+        """Return whether the tool stays inside while every joint brakes at its cap from `following`.
+
+        The joints do not come to rest together, so the way is sampled in time, not between its ends. Already
+        outside, the tool may get no further out.
+        """
         start = position + (0.5 * self._dt) * (velocity + following)
+        rest = np.maximum(np.abs(following) / self.acceleration_cap, 1e-9)
+        times = np.minimum(_SAMPLES * rest.max(), rest)
         allowed = min(0.0, self.sphere.room(tool))
-        return (
-            self.sphere.room(self._tool(start + braking)) >= allowed
-            and self.sphere.room(self._tool(start + 0.75 * braking)) >= allowed
-        )
+        for braking in following * times * (1.0 - 0.5 * times / rest):
+            if self.sphere.room(self._tool(start + braking)) < allowed:
+                return False
+        return True

@@ -140,7 +140,7 @@ class Bench:
         plant = self.plant
         while plant.time_ns + PHYSICS_STEP_NS <= to_ns:
             for drive in self._servos:
-                drive.servo(_STEP_S)
+                drive.step(_STEP_S)
             plant.advance(plant.time_ns + PHYSICS_STEP_NS)
 
     def _happen(self, now: int) -> None:

@@ -25,6 +25,7 @@ from robotctl.hal.can.damiao.codec import (
 from robotctl.hal.can.damiao.motors import Ranges
 from robotctl.hal.can.damiao.registers import CAN_BITRATES, ControlMode, Register, decode_value, encode_value
 from robotctl.sim.motors.memory import Memory, accepts
+from robotctl.sim.motors.servo import Servo
 from robotctl.sim.motors.shaft import Shaft
 from robotctl.sim.motors.thermal import Thermal
 
@@ -35,8 +36,6 @@ _TIMEOUT_UNIT_NS = 50_000
 _U16 = 0xFFFF
 _U12 = 0xFFF
 _SPECIAL = 0xFFFFFFFF_FFFFFF00
-_INTEGRAL_RATE = 10.0
-"""How fast the drive's own loops take up a steady load, 1/s."""
 
 Defer = Callable[[int, Callable[[], None]], None]
 """Takes a time in ns and what to do then."""
@@ -88,9 +87,7 @@ class DamiaoDrive:
         """Shaft angle at the zero that is stored in flash."""
         self._turns = 0.0
         self._epoch = 0
-        self._goal: tuple[float, float] | None = None
-        self._setpoint = 0.0
-        self._integral = 0.0
+        self._servo: Servo | None = None
         self.power_up()
 
     # --- what others may ask ----------------------------------------------------------------------------------------
@@ -106,8 +103,8 @@ class DamiaoDrive:
 
     @property
     def is_servoing(self) -> bool:
-        """Whether `servo` has to be called as time passes: a position or speed loop of the drive's own is at work."""
-        return self._goal is not None and self.enabled
+        """Whether `step` has to be called as time passes: a position or speed loop of the drive's own is at work."""
+        return self._servo is not None
 
     @property
     def deadline_ns(self) -> int:
@@ -153,25 +150,10 @@ class DamiaoDrive:
             if fault is not None:
                 self.fail(fault)
 
-    def servo(self, seconds: float) -> None:
-        """Run the drive's own loop for one step: a setpoint that moves no faster than asked, and PID behind it."""
-        if self._goal is None:
-            return
-        target, speed = self._goal
-        if self._mode == ControlMode.VEL:
-            step = speed * seconds
-        else:
-            reach = speed * seconds
-            step = min(max(target - self._setpoint, -reach), reach)
-        angle = self.shaft.state()[0]
-        kp, kd = self.shaft.servo_gains
-        # A setpoint that ran away from a blocked shaft, or an integral beyond the torque there is, would wind up.
-        lead = self._bound / kp
-        self._setpoint = min(max(self._setpoint + step, angle - lead), angle + lead)
-        error = self._setpoint - angle
-        if abs(kp * error + self._integral) < self._bound or error * self._integral < 0.0:
-            self._integral += _INTEGRAL_RATE * kp * error * seconds
-        self.shaft.drive(kp, kd, self._setpoint, step / seconds, self._integral)
+    def step(self, seconds: float) -> None:
+        """Run the drive's own loop, if one is at work."""
+        if self._servo is not None:
+            self._servo.step(seconds)
 
     # --- frames -----------------------------------------------------------------------------------------------------
 
@@ -213,7 +195,7 @@ class DamiaoDrive:
         if len(data) not in (4, 8):
             return None
         if not self._is_special(data, now_ns) and self.enabled and self._mode == ControlMode.VEL:
-            self._aim(now_ns, 0.0, decode_vel(data), None)
+            self._aim(now_ns, None, decode_vel(data), None)
         return self.feedback()
 
     def on_pos_force(self, data: bytes, now_ns: int) -> bytes | None:
@@ -306,7 +288,7 @@ class DamiaoDrive:
 
     def _forget(self) -> None:
         self._epoch += 1
-        self._goal = None
+        self._servo = None
         self.shaft.limit(None)
         if self.enabled:
             self.shaft.drive(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -316,25 +298,26 @@ class DamiaoDrive:
         if epoch == self._epoch:
             self.shaft.drive(kp, kd, position, velocity, effort)
 
-    def _aim(self, now_ns: int, position: float, speed: float, bound: float | None) -> None:
-        if not (isfinite(position) and isfinite(speed)):
+    def _aim(self, now_ns: int, target: float | None, speed: float, bound: float | None) -> None:
+        if not isfinite(speed) or not (target is None or isfinite(target)):
             return
-        aim = partial(self._aim_now, self._epoch, position + self._zero - self._turns, speed, bound)
+        aim = partial(self._aim_now, self._epoch, target, speed, bound)
         if self._delay_ns:
             self._defer(now_ns + self._delay_ns, aim)
         else:
             aim()
 
-    def _aim_now(self, epoch: int, position: float, speed: float, bound: float | None) -> None:
+    def _aim_now(self, epoch: int, target: float | None, speed: float, bound: float | None) -> None:
         if epoch != self._epoch:
             return
-        starting = self._goal is None
-        if starting:
-            self._setpoint = self.shaft.state()[0]
-            self._integral = 0.0
+        starting = self._servo is None
+        if self._servo is None:
+            self._servo = Servo(self.shaft)
         fastest = self.memory[Register.VMAX]
-        self._goal = (position, min(max(speed, -fastest), fastest))
-        self._bound = max(self.memory[Register.TMAX] if bound is None else bound, 1e-6)
+        angle = None if target is None else target + self._zero - self._turns
+        self._servo.aim(
+            angle, min(max(speed, -fastest), fastest), self.memory[Register.TMAX] if bound is None else bound
+        )
         self.shaft.limit(bound)
         if starting:
             self._changed()
@@ -371,7 +354,6 @@ class DamiaoDrive:
         self.id = int(memory[Register.ESC_ID])
         self.reply_id = int(memory[Register.MST_ID])
         self._mode = int(memory[Register.CTRL_MODE])
-        self._bound = tmax
         code = int(memory[Register.CAN_BR])
         self.bitrate = CAN_BITRATES[code] if code < len(CAN_BITRATES) else CAN_BITRATES[-1]
         self.fd = self.bitrate > 1_000_000

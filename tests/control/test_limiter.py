@@ -97,7 +97,8 @@ def test_torques_and_their_rate_are_capped(robot: Robot):
     rng = np.random.default_rng(3)
     previous = np.zeros(robot.dof)
     largest = np.zeros(robot.dof)
-    for wish in (rng.choice([-1e6, -1.0, 0.0, 1.0, 1e6], robot.dof) for _ in range(20) for _ in range(1)):
+    for _ in range(20):
+        wish = rng.choice([-1e6, -1.0, 0.0, 1.0, 1e6], robot.dof)
         for _ in range(60):
             torque = limiter.step(wish, previous)
             assert (np.abs(torque) <= robot.limits.torque).all()

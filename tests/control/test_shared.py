@@ -10,8 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from robotctl.control import shared
 from robotctl.control.shared import MAX_VALUES, Board, Desk, EventRing, Link, Mailbox, TickRing, tick_dtype
+from robotctl.hal.robot import load_robot
+from robotctl.safety.admission import Admission
 from robotctl.safety.target import FreeDrive, Hold, JointTorque, JointVelocity
+from robotctl.safety.trip import Protection
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 HEADS = st.tuples(INT64, INT64, INT64)
@@ -76,12 +80,9 @@ def test_a_version_that_moves_while_it_is_read_counts_as_torn(monkeypatch):
     writer, reader = Mailbox(buffer), Mailbox(buffer)
     writer.put(Hold(0, 1, 0))
 
-    class Racing(bytearray):
+    class Form:
         """Whoever reads the body finds the next version begun."""
 
-    import robotctl.control.shared as shared
-
-    class Form:
         size = shared._TARGET.size
 
         def unpack_from(self, data, at):
@@ -99,10 +100,6 @@ def test_a_version_that_moves_while_it_is_read_counts_as_torn(monkeypatch):
 
 @pytest.mark.parametrize("number", [0, 5, -1, 2**31 - 1])
 def test_an_unknown_kind_becomes_something_admission_refuses(number):
-    from robotctl.hal.robot import load_robot
-    from robotctl.safety.admission import Admission
-    from robotctl.safety.trip import Protection
-
     buffer = bytearray(Mailbox.SIZE)
     writer, reader = Mailbox(buffer), Mailbox(buffer)
     writer.put(JointVelocity(np.ones(7), 0, 1, 10**9))

@@ -65,7 +65,9 @@ def test_sphere(robot: Robot, direction, step):
 
 def test_the_spheres_breach_is_measured_from_the_full_radius_not_from_the_shapers(panda: Robot):
     centre = np.array(panda.profile.sphere.centre)
-    assert SphereBreach(panda).outside(centre + [0.0, 0.0, panda.profile.sphere.radius]) == pytest.approx(0.0, abs=1e-12)
+    assert SphereBreach(panda).outside(centre + [0.0, 0.0, panda.profile.sphere.radius]) == pytest.approx(
+        0.0, abs=1e-12
+    )
     assert SphereBreach(panda).outside(centre) == -panda.profile.sphere.radius
 
 

@@ -519,6 +519,24 @@ def test_what_was_under_way_at_a_stop_never_acts() -> None:
     assert host.drive.shaft.state()[2] == 0.0
 
 
+def test_the_first_command_does_not_kick_through_the_lag() -> None:
+    host = Host(load_robot("panda", ["twin.lag_s=0.02"]))
+    host.special(Special.ENABLE)
+    position, _, effort = host.drive.shaft.state()
+    for _ in range(50):
+        host.mit(position, 0.0, 50.0, 1.0, effort)
+        host.wait(2)
+        assert host.drive.shaft.state()[0] == pytest.approx(position, abs=0.02)
+
+
+def test_drives_that_are_off_leave_the_arm_where_it_lies() -> None:
+    for name in ("panda", "openarm"):
+        host = Host(load_robot(name))
+        before = host.bench.plant.truth().position
+        host.wait(2000)
+        assert host.bench.plant.truth().position == pytest.approx(before, abs=2e-3)
+
+
 def test_noise_is_seeded() -> None:
     def run(seed: int) -> list:
         host = Host(load_robot("panda", ["twin.noise_position=0.01"]), seed=seed)
