@@ -81,6 +81,7 @@ class Loop:
         self._damping = False
         self._lowering_ns: int | None = None
         self._closing = False
+        self._answer: tuple[int, str] | None = None
         self._ticks = 0
         self._reported = 0
         self._state = State.OFF
@@ -148,6 +149,7 @@ class Loop:
         if supervisor.state is not self._state or self._reported != len(supervisor.trips):
             self._report(now)
         self._publish(sample, tool, now)
+        self._give_answer(now)
 
     def _drive(self, sample: Sample, now: int) -> None:
         """Send the command of a state with enabled drives."""
@@ -260,8 +262,17 @@ class Loop:
             self._carry_out(Verb(verb), now)
         except (Refused, RobotctlError) as error:
             text = str(error)
-        self._link.events.write({"type": "answer", "stamp_ns": now, "number": number, "ok": not text, "text": text})
-        self._link.desk.answer(number)
+        self._answer = (number, text)
+        if self.closed:
+            self._give_answer(now)
+
+    def _give_answer(self, now: int) -> None:
+        """Answer the request of this tick, after its record is out: who asked must find the state it led to."""
+        if self._answer is not None:
+            number, text = self._answer
+            self._answer = None
+            self._link.events.write({"type": "answer", "stamp_ns": now, "number": number, "ok": not text, "text": text})
+            self._link.desk.answer(number)
 
     def _carry_out(self, verb: Verb, now: int) -> None:
         supervisor = self.supervisor

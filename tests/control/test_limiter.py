@@ -13,9 +13,7 @@ def wishes(robot, kind, rng, count):
     cap = robot.limits.velocity
     wish = np.zeros(robot.dof)
     for tick in range(count):
-        if kind == "random" and tick % 25 == 0:
-            wish = rng.uniform(-2.0, 2.0, robot.dof) * cap
-        elif kind == "restless":
+        if kind == "restless" or (kind == "random" and tick % 25 == 0):
             wish = rng.uniform(-2.0, 2.0, robot.dof) * cap
         elif kind == "bang" and tick % 60 == 0:
             wish = rng.choice([-1e300, -10.0, 0.0, 10.0, 1e300], robot.dof)

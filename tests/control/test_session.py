@@ -78,7 +78,7 @@ def test_waiting_for_a_state_names_the_trip_that_came_between(session):
 def test_waiting_in_vain_ends_in_time(session):
     session.request(Verb.ARM)
     before = session.clock.now_ns()
-    with pytest.raises(HardwareError, match="state RUN not reached within 0.5 s"):
+    with pytest.raises(HardwareError, match=r"state RUN not reached within 0\.5 s"):
         session.wait_for(State.RUN, timeout_s=0.5)
     assert session.clock.now_ns() - before == pytest.approx(0.5e9, abs=0.02e9)
 

@@ -22,7 +22,7 @@ def observation(robot, kinematics, goal, step=0, position=None):
 def test_scripted_brings_the_tool_to_its_goal(robot: Robot, kinematics: Kinematics):
     policy = make_policy("scripted", robot, kinematics)
     position = np.array(robot.profile.home)
-    goal = kinematics.tool(position) + [-0.05, 0.05, -0.05]
+    goal = kinematics.tool(position) + np.array([-0.05, 0.05, -0.05])
     distances = []
     for step in range(100):
         velocity = policy.act(observation(robot, kinematics, goal, step, position))
@@ -38,7 +38,7 @@ def test_scripted_brings_the_tool_to_its_goal(robot: Robot, kinematics: Kinemati
 def test_scripted_limits_the_tools_speed(robot: Robot, kinematics: Kinematics):
     policy = make_policy("scripted", robot, kinematics)
     home = np.array(robot.profile.home)
-    far = kinematics.tool(home) + [0.0, 0.0, -1.0]
+    far = kinematics.tool(home) + np.array([0.0, 0.0, -1.0])
     velocity = policy.act(observation(robot, kinematics, far))
     _, jacobian = kinematics.tool_and_jacobian(home)
     assert np.linalg.norm(jacobian @ velocity) <= 0.35 + 1e-6

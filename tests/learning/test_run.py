@@ -20,13 +20,13 @@ COMBINATIONS = [(name, "sim") for name in robot_names()] + [("panda", "can"), ("
 
 
 @functools.cache
-def result_of(name, backend, policy="scripted", steps=150):
+def result_of(name, backend, policy="scripted", steps=150, episodes=EPISODES):
     """Return the outcome of a run, and its report."""
     task = load_task("reach").model_copy(update={"steps": steps})
     about = {"backend": backend, "robot": name, "task": task.name, "policy": policy, "seed": SEED}
     with LockstepSession(load_robot(name), backend) as session:
         actor = InlineActor(session, task, policy, SEED)
-        outcome = run_episodes(session, actor, task, EPISODES, SEED)
+        outcome = run_episodes(session, actor, task, episodes, SEED)
         made = report(session, outcome, about, SessionRecording(Path("nowhere.mcap")))
     return outcome, json.loads(json.dumps(made, allow_nan=False))
 
@@ -104,11 +104,13 @@ def test_a_treacherous_policy_ends_the_run_with_the_drives_off(backend, policy, 
 @pytest.mark.parametrize(("name", "backend"), COMBINATIONS)
 @pytest.mark.parametrize("policy", ["random", "outward"])
 def test_a_hostile_policy_is_clipped_but_harms_nothing(name, backend, policy):
-    outcome, made = result_of(name, backend, policy, steps=40)
+    outcome, made = result_of(name, backend, policy, steps=60, episodes=1)
     assert outcome.stopped == ""
     assert made["safety"]["violations"] == {"position": 0, "velocity": 0, "sphere": 0}
-    assert made["safety"]["clipped_ticks"] > 100
-    assert [episode["steps"] for episode in made["episodes"]] == [40, 40]
+    assert [episode["steps"] for episode in made["episodes"]] == [60]
+    if policy == "outward":  # else nothing was tested
+        assert made["safety"]["clipped_ticks"] > 500
+        assert made["safety"]["worst_excess"]["sphere"] > -0.05
     assert made["safety"]["state"] == "READY"
 
 

@@ -31,7 +31,7 @@ def plant(records, index, key, excess, prefix="true_"):
     elif key == "velocity":
         records[prefix + "velocity"][index, 2] = -(ROBOT.limits.velocity[2] + excess)
     else:
-        records[prefix + "tool"][index] = CENTRE + [0.0, RADIUS + excess, 0.0]
+        records[prefix + "tool"][index] = CENTRE + np.array([0.0, RADIUS + excess, 0.0])
 
 
 BOUNDS = {"position": POSITION_BOUND, "velocity": ROBOT.profile.safety.velocity_tolerance, "sphere": SPHERE_BOUND}

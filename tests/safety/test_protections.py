@@ -34,7 +34,7 @@ def test_position(robot: Robot, side, step):
 
 
 def test_the_worst_joint_is_named(panda: Robot):
-    position = np.array(panda.limits.upper) + [0.0, 0.1, 0.0, 0.0, 0.3, 0.0, 0.0]
+    position = np.array(panda.limits.upper) + np.array([0.0, 0.1, 0.0, 0.0, 0.3, 0.0, 0.0])
     assert "panda_joint5" in PositionBreach(panda).check(sample(position)).cause
 
 
@@ -65,7 +65,7 @@ def test_sphere(robot: Robot, direction, step):
 
 def test_the_spheres_breach_is_measured_from_the_full_radius_not_from_the_shapers(panda: Robot):
     centre = np.array(panda.profile.sphere.centre)
-    assert SphereBreach(panda).outside(centre + [0.0, 0.0, panda.profile.sphere.radius]) == pytest.approx(
+    assert SphereBreach(panda).outside(centre + np.array([0.0, 0.0, panda.profile.sphere.radius])) == pytest.approx(
         0.0, abs=1e-12
     )
     assert SphereBreach(panda).outside(centre) == -panda.profile.sphere.radius
@@ -117,7 +117,7 @@ def test_thresholds_come_from_the_profile(key):
         rest = np.array(robot.profile.home)
         beyond = rest.copy()
         beyond[0] = robot.limits.upper[0] + 0.4
-        outside = np.array(robot.profile.sphere.centre) + [robot.profile.sphere.radius + 0.4, 0.0, 0.0]
+        outside = np.array(robot.profile.sphere.centre) + np.array([robot.profile.sphere.radius + 0.4, 0.0, 0.0])
         found = {
             "position_breach": PositionBreach(robot).check(sample(beyond)),
             "sphere_breach": SphereBreach(robot).check(outside, 0),

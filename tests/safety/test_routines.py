@@ -77,7 +77,7 @@ def test_goto_arrives_within_its_caps(robot: Robot, kinematics: Kinematics):
 
 def test_goto_leads_along_a_straight_line(panda: Robot):
     home = np.array(panda.profile.home)
-    start = home + [0.3, 0.0, 0.1, 0.0, 0.0, 0.0, -0.2]
+    start = home + np.array([0.3, 0.0, 0.1, 0.0, 0.0, 0.0, -0.2])
     routine = Goto(panda, home, "home", Kinematics(panda))
     wanted = routine.velocity(sample(start), start)
     assert np.cross((home - start)[[0, 2, 6]], wanted[[0, 2, 6]]) == pytest.approx(np.zeros(3), abs=1e-12)

@@ -23,7 +23,7 @@ def test_the_radius_is_the_profiles_less_the_margin(robot: Robot):
     sphere = BoundingSphere(robot.profile)
     assert sphere.radius == robot.profile.sphere.radius - robot.profile.safety.sphere_margin
     assert sphere.room(sphere.centre) == sphere.radius
-    assert sphere.room(sphere.centre + [0.0, sphere.radius + 0.03, 0.0]) == pytest.approx(-0.03)
+    assert sphere.room(sphere.centre + np.array([0.0, sphere.radius + 0.03, 0.0])) == pytest.approx(-0.03)
 
 
 def test_the_row_is_the_derivative_of_the_distance(robot: Robot, kinematics: Kinematics, poses):
@@ -42,7 +42,7 @@ def test_the_row_is_the_derivative_of_the_distance(robot: Robot, kinematics: Kin
 @pytest.mark.parametrize("distance", [-0.3, -0.02, -0.01 - 1e-9, -0.009, -1e-6, 0.0, 1e-6, 0.01, 0.1, 0.3])
 def test_the_bound_is_proportional_to_the_room_and_the_correction_is_capped(panda: Robot, distance):
     sphere = BoundingSphere(panda.profile)
-    tool = sphere.centre + [sphere.radius - distance, 0.0, 0.0]
+    tool = sphere.centre + np.array([sphere.radius - distance, 0.0, 0.0])
     row = sphere.row(tool, np.eye(3, 7))
     assert row.bound == pytest.approx(max(sphere.gain * distance, -0.05), abs=1e-12)
     assert row.normal == pytest.approx([1, 0, 0, 0, 0, 0, 0])
@@ -53,9 +53,9 @@ def test_at_the_centre_there_is_no_row_and_nothing_to_divide_by(panda: Robot):
     jacobian = np.ones((3, 7))
     with np.errstate(all="raise"):
         assert sphere.row(sphere.centre.copy(), jacobian) is None
-        assert sphere.row(sphere.centre + [0.9e-3, 0.0, 0.0], jacobian) is None
+        assert sphere.row(sphere.centre + np.array([0.9e-3, 0.0, 0.0]), jacobian) is None
         assert sphere.project(np.ones(7), sphere.centre.copy(), jacobian, 1e6) is not None
-    assert sphere.row(sphere.centre + [1.1e-3, 0.0, 0.0], jacobian) is not None
+    assert sphere.row(sphere.centre + np.array([1.1e-3, 0.0, 0.0]), jacobian) is not None
 
 
 def test_a_singular_row_asks_for_nothing(panda: Robot):
@@ -63,7 +63,7 @@ def test_a_singular_row_asks_for_nothing(panda: Robot):
     sphere = BoundingSphere(panda.profile)
     jacobian = np.zeros((3, 7))
     jacobian[1, 0] = 1.0
-    row = sphere.row(sphere.centre + [sphere.radius - 0.01, 0.0, 0.0], jacobian)
+    row = sphere.row(sphere.centre + np.array([sphere.radius - 0.01, 0.0, 0.0]), jacobian)
     assert not row.normal.any()
     assert row.bound > 0.0
 
@@ -107,7 +107,7 @@ def test_projection_takes_the_outward_part_away_and_adds_the_correction(robot: R
 
 def test_projection_outside_keeps_an_inward_velocity_and_adds_to_it(panda: Robot):
     sphere = BoundingSphere(panda.profile)
-    tool = sphere.centre + [sphere.radius + 0.02, 0.0, 0.0]
+    tool = sphere.centre + np.array([sphere.radius + 0.02, 0.0, 0.0])
     velocity = np.array([-0.1, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
     shaped = sphere.project(velocity, tool, np.eye(3, 7), 0.002)
     assert shaped[:2] == pytest.approx([-0.1 - sphere.gain * 0.02, 0.3], abs=1e-5)

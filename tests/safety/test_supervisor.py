@@ -116,7 +116,7 @@ def test_of_two_trips_the_harder_counts(first, second):
 @pytest.mark.parametrize("protection", [Protection.POSITION, Protection.SPHERE])
 def test_of_simultaneous_findings_the_harder_one_stops(protection):
     bench = Bench(State.RUN)
-    bench.tool = CENTRE + [0.0, 0.0, 2.0]  # category 2
+    bench.tool = CENTRE + np.array([0.0, 0.0, 2.0])  # category 2
     bench.reference = HOME + 1.0  # category 1
     if protection is Protection.POSITION:
         bench.position = np.array(ROBOT.limits.upper) + 0.1
@@ -488,7 +488,7 @@ def test_recovery_survives_the_way_through_a_fault():
 def test_in_recovery_the_breach_itself_does_not_trip_again_but_everything_else_does():
     bench = Bench(State.RESET)
     bench.supervisor.recovery = True
-    bench.tool = CENTRE + [0.0, 0.0, 2.0]
+    bench.tool = CENTRE + np.array([0.0, 0.0, 2.0])
     bench.position[0] = ROBOT.limits.upper[0] + 0.5
     assert bench.observe() is State.RESET
     bench.reference = bench.position + 1.0
@@ -503,7 +503,7 @@ def test_arming_outside_a_limit_begins_the_recovery(beyond, tool_out, recovers):
     bench = Bench(State.ARMED)
     position = HOME.copy()
     position[1] = ROBOT.limits.lower[1] - beyond
-    tool = CENTRE + [ROBOT.profile.sphere.radius + tool_out, 0.0, 0.0]
+    tool = CENTRE + np.array([ROBOT.profile.sphere.radius + tool_out, 0.0, 0.0])
     none = np.zeros(7)
     bench.supervisor.begin_recovery_if_outside(Sample(0, position, none, none, np.zeros(7, np.int64)), tool)
     assert bench.supervisor.recovery is recovers
