@@ -51,11 +51,13 @@ def test_the_control_process_loads_nothing_that_draws_learns_or_logs() -> None:
 @pytest.mark.parametrize("package", ["hal", "safety", "sim", "control"])
 def test_no_bare_except_and_no_wall_clock(package: str) -> None:
     for path in (ROOT / package).rglob("*.py"):
+        lines = path.read_text().splitlines()
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ExceptHandler):
                 assert node.type is not None, f"{path}:{node.lineno}: bare except"
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-                assert (node.value.id, node.attr) != ("time", "time"), f"{path}:{node.lineno}: wall clock"
+                waived = "# wall clock: " in lines[node.lineno - 1]  # the reason stands behind it
+                assert (node.value.id, node.attr) != ("time", "time") or waived, f"{path}:{node.lineno}: wall clock"
 
 
 def test_safety_reads_no_clock_and_does_no_io() -> None:

@@ -157,7 +157,7 @@ class Transport:
             raise self._gone()
         now = self._clock.now_ns()
         recv, routes, simulated = self._recv, self.routes, self.simulated
-        wall = 0.0 if simulated else time.time()
+        wall = 0.0 if simulated else time.time()  # wall clock: the kernel stamps frames by it
         failures = 0
         for _ in range(DRAIN_LIMIT):
             try:

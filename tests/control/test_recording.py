@@ -73,10 +73,10 @@ def test_values_survive_the_round_trip(path):
 
 def test_safety_channel_names_state_and_clips(path):
     records = make_records(3)
-    records["clip"] = [0, Clip.VELOCITY | Clip.SPHERE, Clip.TORQUE]
+    records["clip"] = [0, Clip.VELOCITY | Clip.SPHERE, Clip.RECOVERY]
     records["state"] = [State.RUN, State.STOPPING, 77]
     messages = [logged.message for logged in record(path, records).topics["/safety"]]
-    assert [message["clip"] for message in messages] == [[], ["VELOCITY", "SPHERE"], ["TORQUE"]]
+    assert [message["clip"] for message in messages] == [[], ["VELOCITY", "SPHERE"], ["RECOVERY"]]
     assert [message["state"] for message in messages] == ["RUN", "STOPPING", "UNKNOWN(77)"]
     assert messages[1] == {
         "tick": 1,

@@ -38,5 +38,7 @@ def test_a_treacherous_policy_is_stopped_and_recorded(start: Any, backend: str, 
     assert report["safety"]["violations"] == {"position": 0, "velocity": 0, "sphere": 0}
     assert report["stopped"].startswith(protection)
     with open(report["black_boxes"][0], "rb") as file:
-        events = [message.data for _, channel, message in make_reader(file).iter_messages() if channel.topic == "/event"]
+        events = [
+            message.data for _, channel, message in make_reader(file).iter_messages() if channel.topic == "/event"
+        ]
     assert any(protection.encode() in event for event in events)

@@ -332,6 +332,16 @@ def test_one_joint_that_moves_is_not_standstill():
         assert bench.observe() is State.STOPPING
 
 
+def test_a_harder_stop_waits_for_a_standstill_of_its_own():
+    bench = Bench(State.STOPPING)
+    for _ in range(4):
+        bench.observe()
+    bench.supervisor.trip(a_trip(Category.BRAKE_OFF))
+    for _ in range(4):
+        assert bench.observe() is State.STOPPING
+    assert bench.observe() is State.DISABLED
+
+
 @pytest.mark.parametrize(
     ("category", "state"), [(Category.BRAKE_HOLD, State.HOLD), (Category.BRAKE_OFF, State.DISABLED)]
 )

@@ -31,7 +31,7 @@ TRIES = 5
 REPLY_TIMEOUT_S = 0.05
 """Time a drive has for its reply. A round trip takes about 0.3 ms on CAN FD, 1.6 ms in a user-mode kernel."""
 
-CONFIRM_TIMEOUT_S = 0.05
+CONFIRM_TIMEOUT_S = 0.02
 """The same where the request is resent anyway and other drives wait."""
 
 _TWIN_TIMEOUT_S = 0.002
