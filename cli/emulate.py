@@ -10,9 +10,11 @@ from rich.table import Table
 
 from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.output import write_json
+from robotctl.hal.can.damiao.faults import status_name
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.robot import load_robot
 from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.damiao import DamiaoDrive
 from robotctl.sim.motors.orders import REGISTER_FORM, TROUBLE_FORM, order_register, order_trouble
 from robotctl.sim.motors.ports import open_port
 from robotctl.sim.motors.server import Port, Server
@@ -50,6 +52,7 @@ def emulate(
             for order in trouble or ():
                 order_trouble(bench, order)
             server = Server(bench, port, clock)
+            server.on_status = _tell
             _announce(bench, port)
             _write(json, robot, bench, port, server)
             end = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
@@ -61,6 +64,11 @@ def emulate(
             _write(json, robot, bench, port, server)
     if interrupted:
         raise typer.Exit(Exit.INTERRUPTED)
+
+
+def _tell(drive: DamiaoDrive, before: int, silent_s: float) -> None:
+    change = f"{status_name(before)} -> {status_name(drive.status)}"
+    print(f"{drive.name}: {change}, {1e3 * silent_s:.0f} ms after the last frame", flush=True)
 
 
 def _announce(bench: Bench, port: Port) -> None:

@@ -172,7 +172,7 @@ class Shaper:
                 self._hessian, -wanted, row.normal[np.newaxis], bounds[1], bounds[0], sense
             )
             if flag in _SOLVED:
-                return np.minimum(np.maximum(solution, lower), upper)
+                return np.asarray(np.minimum(np.maximum(solution, lower), upper))
         return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
 
     def _stops_inside(self, position: Vector, velocity: Vector, following: Vector, tool: Vector) -> bool:

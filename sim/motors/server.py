@@ -9,6 +9,7 @@ import can
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError
 from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.damiao import DamiaoDrive
 
 POLL_S = 0.0005
 """Longest wait for a frame before time is let pass."""
@@ -107,10 +108,13 @@ class Server:
         self.answered = 0
         self.lost = 0
         """Replies that did not leave: CAN FD on a classic channel, or a queue that was full."""
+        self.on_status: Callable[[DamiaoDrive, int, float], None] | None = None
+        """Called when a drive's status changes: the drive, its old status, seconds since it last heard a frame."""
         self._bench = bench
         self._port = port
         self._clock = clock
         self._round_ns = clock.now_ns()
+        self._statuses = [drive.status for drive in bench.drives]
 
     def serve(self, is_over: Callable[[], bool]) -> None:
         """Serve until `is_over()`.
@@ -150,3 +154,11 @@ class Server:
                 self.lost += 1
             else:
                 self.answered += 1
+        if self.on_status is not None:
+            self._watch(self.on_status)
+
+    def _watch(self, report: Callable[[DamiaoDrive, int, float], None]) -> None:
+        for index, drive in enumerate(self._bench.drives):
+            if drive.status != self._statuses[index]:
+                before, self._statuses[index] = self._statuses[index], drive.status
+                report(drive, before, (self._bench.now_ns - drive.fed_ns) * 1e-9)

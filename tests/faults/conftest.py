@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -12,6 +13,9 @@ from typing import Any
 
 import pytest
 
+KILLS = int(os.environ.get("ROBOTCTL_KILLS", "1"))
+MOMENTS = [random.Random(seed).uniform(0.0, 1.5) for seed in range(KILLS)]
+"""When to strike, in seconds after a run has got going."""
 ROBOTCTL = [sys.executable, "-m", "robotctl.cli.main"]
 
 

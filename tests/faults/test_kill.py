@@ -1,16 +1,16 @@
 """kill -9 and kill -STOP of every process of a run, at random moments."""
 
 import os
-import random
 import signal
 import time
 from typing import Any
 
 import pytest
 
+from .conftest import MOMENTS
+
 pytestmark = pytest.mark.realtime
 LONG = ("--policy", "random", "--episodes", "4")
-MOMENTS = [random.Random(seed).uniform(0.0, 1.5) for seed in range(2)]
 
 
 @pytest.mark.parametrize("moment", MOMENTS)

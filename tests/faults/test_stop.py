@@ -1,6 +1,7 @@
 """`robotctl stop` from another terminal, and policies that misbehave, in real time."""
 
 import subprocess
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -37,7 +38,7 @@ def test_a_treacherous_policy_is_stopped_and_recorded(start: Any, backend: str, 
     assert report["safety"]["trips"][0]["protection"] == protection
     assert report["safety"]["violations"] == {"position": 0, "velocity": 0, "sphere": 0}
     assert report["stopped"].startswith(protection)
-    with open(report["black_boxes"][0], "rb") as file:
+    with Path(report["black_boxes"][0]).open("rb") as file:
         events = [
             message.data for _, channel, message in make_reader(file).iter_messages() if channel.topic == "/event"
         ]

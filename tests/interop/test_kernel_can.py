@@ -32,7 +32,7 @@ def test_socketcan_of_a_real_kernel(tmp_path: Path) -> None:
         assert not REQUIRED, "install user-mode-linux and kmod"
         pytest.skip("needs Debian's user-mode-linux and kmod, which .ci/run installs")
     (tmp_path / "command").write_text(
-        f"cd {ROOT} && exec {sys.executable} -m pytest -q -x -p no:cacheprovider -o timeout={BOOT_AND_TESTS_S} {FOLDER}\n"
+        f"cd {ROOT}\nexec {sys.executable} -m pytest -q -x -p no:cacheprovider -o timeout={BOOT_AND_TESTS_S} {FOLDER}\n"
     )
     arguments = [
         "mem=1G",
