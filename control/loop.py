@@ -19,7 +19,7 @@ from robotctl.hal.clock import Clock
 from robotctl.hal.errors import RobotctlError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample, Truth, Vector
-from robotctl.safety.machine import ENABLED, Event, Refused, State
+from robotctl.safety.machine import ENABLED, Event, Refused, State, after
 from robotctl.safety.routines import Goto, Retreat, Routine, Settle
 from robotctl.safety.shaper import Clip, Shaper
 from robotctl.safety.supervisor import Supervisor
@@ -45,6 +45,8 @@ class Verb(IntEnum):
     ACK = 9
     ESTOP = 10
     CLOSE = 11
+    SELFTEST = 12
+    """Again, after one that failed."""
 
 
 _VERBS = frozenset(Verb)
@@ -297,13 +299,17 @@ class Loop:
                 supervisor.handle(Event.STOP)
             case Verb.DISARM:
                 supervisor.handle(Event.DISARM)
+            case Verb.ACK if self._damping:
+                self._lowering_ns = self._lowering_ns or now
+                raise RobotctlError("the arm is being lowered first", "acknowledge again once it is down")
             case Verb.ACK:
                 if supervisor.handle(Event.ACK) is State.SILENT:
                     self._arm.disable()
-                    self._damping = False
                     self._selftest()
                 else:
                     self._reference.resync(self._reference.position, self._reference.velocity)
+            case Verb.SELFTEST:
+                self._selftest()
             case Verb.ESTOP:
                 self._serve_estop("the operator", now)
             case Verb.CLOSE:
@@ -317,6 +323,7 @@ class Loop:
         self._routine_ends_ns = now + round(routine.timeout_s * 1e9)
 
     def _selftest(self) -> None:
+        after(self.supervisor.state, Event.SELFTEST)  # refused before anything is asked of the drives
         self._arm.verify()
         self.supervisor.handle(Event.SELFTEST)
 

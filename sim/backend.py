@@ -21,7 +21,7 @@ def open_sim(robot: Robot, clock: Clock, channel: str = "") -> Rig:
         raise ConfigError(f"the sim backend has no channel, got {channel!r}", "use --backend can, or drop --channel")
     plant = Plant(robot, clock.now_ns())
     arm = SimArm(robot, plant, clock)
-    gripper = SimGripper(robot.profile.gripper, plant, clock) if robot.profile.gripper else None
+    gripper = SimGripper(robot.profile.gripper, plant, clock, arm) if robot.profile.gripper else None
     return Rig(arm, gripper)
 
 
@@ -44,6 +44,11 @@ class SimArm(Arm):
         self._waiting: deque[tuple[int, Command]] = deque()
         self._connected = False
         self._enabled = False
+
+    @property
+    def enabled(self) -> bool:
+        """Whether its drives are on."""
+        return self._enabled
 
     def connect(self) -> None:
         self._connected = True
@@ -90,9 +95,11 @@ class SimArm(Arm):
 
     def disable(self) -> None:
         self._waiting.clear()
+        if not self._enabled:
+            return
         self._enabled = False
         self._plant.advance(self._clock.now_ns())
-        for axis in range(self._plant.dof):
+        for axis in range(self._plant.axes):
             self._plant.release(axis)
 
     def clear_faults(self) -> None:
@@ -143,12 +150,16 @@ class SimArm(Arm):
 
 
 class SimGripper(Gripper):
-    """A gripper in MuJoCo: its fingers go to the commanded width at the profile's speed."""
+    """A gripper in MuJoCo: its fingers go to the commanded width at the profile's speed.
 
-    def __init__(self, profile: GripperProfile, plant: Plant, clock: Clock) -> None:
+    Its drive goes on and off with the arm's; what was commanded before is forgotten when it does.
+    """
+
+    def __init__(self, profile: GripperProfile, plant: Plant, clock: Clock, arm: SimArm) -> None:
         self._profile = profile
         self._plant = plant
         self._clock = clock
+        self._arm = arm
         self._axis = plant.dof
         self._target: float | None = None
         self._reference = 0.0
@@ -156,6 +167,9 @@ class SimGripper(Gripper):
 
     def command(self, width: float, force: float) -> None:
         check_grip(self._profile, width, force)
+        if not self._arm.enabled:
+            return
+        self._plant.limit(self._axis, force)
         if self._target is None:
             self._reference = self.read().width
             self._stepped_ns = self._clock.now_ns()
@@ -168,6 +182,8 @@ class SimGripper(Gripper):
         return GripperSample(self._clock.now_ns(), width, abs(state.effort))
 
     def step(self) -> None:
+        if not self._arm.enabled:
+            self._target = None
         if self._target is None:
             return
         now = self._clock.now_ns()

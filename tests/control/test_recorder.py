@@ -12,7 +12,7 @@ import pytest
 
 from robotctl.control.recorder import RecorderConfig, RecorderProcess
 from robotctl.control.recording import read_recording
-from robotctl.control.shared import Board, Link
+from robotctl.control.shared import Board, EventRing, Link
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import load_robot
 
@@ -120,7 +120,7 @@ def test_dropped_ticks_and_events_are_counted(start):
         for logged in read_recording(recorder.path).topics["/event"]
         if logged.message["type"] == "dropped"
     ]
-    assert [(event["ticks"], event["events"]) for event in dropped] == [(864, 45)]
+    assert [(event["ticks"], event["events"]) for event in dropped] == [(864, 300 - EventRing.SLOTS + 1)]
     assert ticks_in(recorder.path) == list(range(864, 1000))
 
 
@@ -245,7 +245,7 @@ def test_killed_parent_leaves_a_finished_file(tmp_path):
     source = f"""
 import os, sys, time
 from robotctl.control.recorder import RecorderProcess
-from robotctl.control.shared import Link
+from robotctl.control.shared import Link, EventRing
 from robotctl.hal.robot import load_robot
 robot = load_robot("panda")
 link = Link.create(robot.dof, {SLOTS})
