@@ -12,6 +12,7 @@ from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.output import write_json
 from robotctl.hal.can.damiao.faults import status_name
 from robotctl.hal.clock import MonotonicClock
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import load_robot
 from robotctl.sim.motors.bench import Bench
 from robotctl.sim.motors.damiao import DamiaoDrive
@@ -29,8 +30,11 @@ def emulate(
         ),
     ] = "slcan",
     adapters: Annotated[int, typer.Option(min=1, max=16, help="slcan adapters to offer, all on one bus.")] = 1,
-    classic: Annotated[
-        bool, typer.Option("--classic", help="Set the drives to classic CAN at 1 Mbit/s even where CAN FD would pass.")
+    fd: Annotated[
+        bool,
+        typer.Option(
+            "--fd", help="Set the drives to CAN FD at 5 Mbit/s, where they answer in CAN FD whatever they hear."
+        ),
     ] = False,
     seconds: Annotated[float | None, typer.Option(min=0.0, help="Stop after this time instead of at Ctrl-C.")] = None,
     trouble: Annotated[list[str] | None, typer.Option(help=f"What goes wrong; repeatable. {TROUBLE_FORM}.")] = None,
@@ -45,8 +49,10 @@ def emulate(
         clock = MonotonicClock()
         loaded = load_robot(robot)
         with closing(open_port(channel, loaded, adapters)) as port:
-            # The host of an slcan adapter starts with classic CAN, and hears nothing of drives that answer in CAN FD.
-            bench = Bench(loaded, clock.now_ns(), fd=port.fd and not classic, seed=seed)
+            # As they leave the factory, drives answer in classic CAN, which every host hears; CAN FD is a setting.
+            if fd and not port.fd:
+                raise ConfigError(f"no CAN FD passes on {port.name}", "drop --fd, or serve on an interface with mtu 72")
+            bench = Bench(loaded, clock.now_ns(), fd=fd, seed=seed)
             for order in register or ():
                 order_register(bench, order)
             for order in trouble or ():

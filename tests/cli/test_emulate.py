@@ -27,7 +27,7 @@ def test_what_cannot_be_done_says_what_to_try(options: list[str], status: int) -
 
 @pytest.mark.parametrize(
     ("options", "fd"),
-    [([], False), (["--channel", "virtual:cli"], True), (["--channel", "virtual:cli", "--classic"], False)],
+    [([], False), (["--channel", "virtual:cli"], False), (["--channel", "virtual:cli", "--fd"], True)],
 )
 def test_report(tmp_path: Path, options: list[str], fd: bool) -> None:
     path = tmp_path / "emulate.json"
@@ -39,3 +39,9 @@ def test_report(tmp_path: Path, options: list[str], fd: bool) -> None:
     assert report["motors"][7] == {
         "joint": "gripper", "id": 8, "reply_id": 0x18, "model": "DM4310", "fd": fd, "status": 0, "flash_cycles": 0,
     }  # fmt: skip
+
+
+def test_can_fd_where_none_passes_is_refused():
+    result = CliRunner().invoke(app, ["emulate", "--fd", "--seconds", "0"])
+    assert result.exit_code == 2
+    assert "no CAN FD passes" in result.output

@@ -83,6 +83,25 @@ class Run:
         self.process.wait()
 
 
+class Emulator:
+    """`robotctl emulate` on a pseudo-terminal."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self.log = folder / "emulate.log"
+        with self.log.open("w") as output:
+            self.process = subprocess.Popen([*ROBOTCTL, "emulate", "--robot", "openarm", *options], stdout=output)
+        deadline = time.monotonic() + 30.0
+        while "channel: " not in self.text:
+            assert self.process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        self.channel = self.text.split("channel: ")[1].split()[0]
+
+    @property
+    def text(self) -> str:
+        return self.log.read_text()
+
+
 def _children(pid: int) -> list[int]:
     try:
         return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]

@@ -3,7 +3,6 @@
 import os
 import re
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,29 +10,10 @@ from typing import Any
 
 import pytest
 
-from .conftest import MOMENTS, ROBOTCTL
+from .conftest import MOMENTS, Emulator
 
 pytestmark = pytest.mark.realtime
 LOST = re.compile(r"(\S+): ENABLED -> COMMUNICATION_LOST, (\d+) ms after the last frame")
-
-
-class Emulator:
-    """`robotctl emulate` on a pseudo-terminal."""
-
-    def __init__(self, folder: Path) -> None:
-        self.log = folder / "emulate.log"
-        with self.log.open("w") as output:
-            self.process = subprocess.Popen([*ROBOTCTL, "emulate", "--robot", "openarm"], stdout=output)
-        deadline = time.monotonic() + 30.0
-        while "channel: " not in self.text:
-            assert self.process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        self.channel = self.text.split("channel: ")[1].split()[0]
-
-    @property
-    def text(self) -> str:
-        return self.log.read_text()
 
 
 @pytest.fixture

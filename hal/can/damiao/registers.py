@@ -93,14 +93,18 @@ REGISTERS: dict[int, RegisterInfo] = {
     53: RegisterInfo("k2", integer=False, writable=False),
     54: RegisterInfo("m_off", integer=False, writable=False),
     55: RegisterInfo("dir", integer=False, writable=False),
+    56: RegisterInfo("motor_off", integer=False, writable=False),
     59: RegisterInfo("Imax", integer=False, writable=False),
     60: RegisterInfo("VBus", integer=False, writable=False),
     61: RegisterInfo("T_pcb", integer=False, writable=False),
     62: RegisterInfo("T_mtr", integer=False, writable=False),
+    63: RegisterInfo("Iu_off", integer=False, writable=False),
+    64: RegisterInfo("Iv_off", integer=False, writable=False),
+    65: RegisterInfo("Iw_off", integer=False, writable=False),
     80: RegisterInfo("p_m", integer=False, writable=False),
     81: RegisterInfo("xout", integer=False, writable=False),
 }
-"""Vendor register list as used by openarm_can and python-damiao-driver; 59 to 62 exist on newer firmware only."""
+"""Vendor register list as used by openarm_can and python-damiao-driver; 56 and 59 to 65 exist on newer firmware only."""
 
 
 def decode_value(register: int, raw: bytes) -> float:
