@@ -11,20 +11,18 @@ from enum import IntEnum
 import numpy as np
 
 from robotctl.control.kinematics import Kinematics
-from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
-from robotctl.control.reference import Reference
+from robotctl.control.motion import Motion
+from robotctl.control.publisher import Publisher
 from robotctl.control.shared import Link
 from robotctl.hal.backend import Rig
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import RobotctlError
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Command, CommandMode, Sample, Truth, Vector
+from robotctl.hal.types import Command, Sample, Vector
 from robotctl.safety.machine import ENABLED, Event, Refused, State, after
 from robotctl.safety.routines import Goto, Retreat, Routine, Settle
-from robotctl.safety.shaper import Clip, Shaper
 from robotctl.safety.supervisor import Supervisor
-from robotctl.safety.target import FreeDrive, JointTorque, JointVelocity, Target
-from robotctl.safety.torque import StoppableMotion
+from robotctl.safety.target import FreeDrive, JointTorque, JointVelocity
 from robotctl.safety.trip import Category, Protection, Trip
 
 _LOWERING_S = 2.0
@@ -66,27 +64,15 @@ class Loop:
         self._gripper = rig.gripper
         self._clock = clock
         self._link = link
-        self._limiter = VelocityLimiter(robot)
-        self._torque_limiter = TorqueLimiter(robot)
-        self._shaper = Shaper(robot, self.kinematics)
-        self._stoppable = StoppableMotion(robot, self.kinematics)
-        self._reference = Reference(robot, self.kinematics)
+        self._motion = Motion(robot, self.kinematics)
+        self._publisher = Publisher(link, clock, robot.dof)
         self._routine: Routine | None = None
         self._routine_ends_ns = 0
-        self._zero = np.zeros(robot.dof)
-        self._no_truth = Truth(self._zero, self._zero, self._zero, np.zeros(3))
-        self._torque: Vector | None = None
-        self._clip = Clip.NONE
-        self._wanted: Vector = self._zero
-        self._command = Command(CommandMode.TRACK, self._zero, self._zero, self._zero)
         self._estop: str = ""
         self._damping = False
         self._lowering_ns: int | None = None
         self._closing = False
         self._answer: tuple[int, str] | None = None
-        self._ticks = 0
-        self._reported = 0
-        self._state = State.OFF
 
     # -- life -----------------------------------------------------------------------------------------------------
 
@@ -138,7 +124,7 @@ class Loop:
                 return
         sample = self._arm.read()
         tool = self.kinematics.tool(sample.position)
-        supervisor.observe(sample, tool, self._reference.position, now)
+        supervisor.observe(sample, tool, self._motion.reference.position, now)
         target = self._link.mailbox.take()
         if target is not None:
             supervisor.offer(target, now)
@@ -148,64 +134,31 @@ class Loop:
             self._cut(sample, now)
         if self._gripper is not None:
             self._gripper.step()
-        if supervisor.state is not self._state or self._reported != len(supervisor.trips):
-            self._report(now)
-        self._publish(sample, tool, now)
+        self._publisher.report(supervisor, now)
+        self._publisher.record(supervisor, self._motion, sample, tool, self._arm.truth(), self.lateness_ns, now)
         self._give_answer(now)
 
     def _drive(self, sample: Sample, now: int) -> None:
         """Send the command of a state with enabled drives."""
-        state = self.supervisor.state
-        target: Target | None = None
-        wanted = self._zero
-        if state is State.RUN:
-            target = self.supervisor.admitted(now)
-        elif state is State.RESET:
+        supervisor, motion = self.supervisor, self._motion
+        wanted, torque = motion.rest, None
+        if supervisor.state is State.RUN:
+            match supervisor.admitted(now):
+                case JointVelocity(values=values):
+                    wanted = values
+                case JointTorque(values=values):
+                    torque = values
+                case FreeDrive():
+                    torque = motion.rest
+        elif supervisor.state is State.RESET:
             wanted = self._routine_velocity(sample, now)
-        match target:
-            case JointVelocity(values=values):
-                wanted = values
-            case JointTorque(values=values):
-                if self._apply_torque(values, sample, now):
-                    return
-            case FreeDrive():
-                if self._apply_torque(self._zero, sample, now):
-                    return
-        if self._torque is not None:
-            self._reference.resync(sample.position, sample.velocity)
-            self._torque = None
-        self._track(wanted, sample)
-
-    def _track(self, wanted: Vector, sample: Sample) -> None:
-        reference = self._reference
-        if wanted is self._zero and not reference.velocity.any():
-            velocity, clip = self._zero, Clip.NONE  # at rest, to stay so: outside the limits, too
-        else:
-            if self.supervisor.category is Category.BRAKE_OFF:
-                limited = self._shaper.brake(reference.velocity)
-            else:
-                limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
-            tool, jacobian = self.kinematics.tool_and_jacobian(reference.position)
-            velocity, clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
-        self._wanted = wanted
-        self._clip = clip | Clip.RECOVERY if self.supervisor.recovery else clip
-        self._command = reference.step(velocity, sample.position)
-        self._arm.write(self._command)
-
-    def _apply_torque(self, torque: Vector, sample: Sample, now: int) -> bool:
-        """Send a torque command if the present motion can still be stopped inside all limits; else trip."""
-        trip = self._stoppable.check(sample)
-        if trip is not None:
-            self.supervisor.trip(trip)
-            return False
-        gravity = self.kinematics.gravity(sample.position)
-        previous = self._command.effort if self._torque is None else self._torque
-        self._torque = self._torque_limiter.step(gravity + torque, previous)
-        self._wanted, self._clip = torque, Clip.NONE
-        self._reference.resync(sample.position, sample.velocity)
-        self._command = Command(CommandMode.EFFORT, sample.position, self._zero, self._torque)
-        self._arm.write(self._command)
-        return True
+        if torque is not None:
+            pushed = motion.push(torque, sample)
+            if isinstance(pushed, Command):
+                self._arm.write(pushed)
+                return
+            supervisor.trip(pushed)
+        self._arm.write(motion.track(wanted, sample, brake=supervisor.category is Category.BRAKE_OFF))
 
     def _cut(self, sample: Sample, now: int) -> None:
         """The profile's category 0 action: drives off, or damped with gravity compensated until told otherwise."""
@@ -221,9 +174,7 @@ class Loop:
             if self._lowering_ns is not None:
                 fade = 1.0 - (now - self._lowering_ns) / (_LOWERING_S * 1e9)
             if fade > 0.0:
-                gravity = fade * self.kinematics.gravity(sample.position)
-                self._command = Command(CommandMode.DAMP, sample.position, self._zero, gravity)
-                self._arm.write(self._command)
+                self._arm.write(self._motion.damp(sample.position, fade))
                 return
         self._damping = False
         self._lowering_ns = None
@@ -232,7 +183,7 @@ class Loop:
         except RobotctlError as error:
             # A drive that does not confirm keeps the arm from READY, but must not end the supervision of the others.
             clean = False
-            self._link.events.write({"type": "log", "stamp_ns": now, "text": str(error)})
+            self._publisher.log(str(error), now)
         if self.supervisor.state is State.DISABLED:
             self.supervisor.handle(Event.OFF_CLEAN if clean else Event.OFF_FAULT)
         if self._closing:
@@ -241,16 +192,16 @@ class Loop:
     def _routine_velocity(self, sample: Sample, now: int) -> Vector:
         routine = self._routine
         if routine is None:
-            return self._zero
-        velocity = routine.velocity(sample, self._reference.position)
+            return self._motion.rest
+        velocity = routine.velocity(sample, self._motion.reference.position)
         if velocity is None:
             self._routine = None
             self.supervisor.handle(Event.RESET_DONE)
-            return self._zero
+            return self._motion.rest
         if now > self._routine_ends_ns:
             cause = f"reset routine {routine.name!r} did not arrive within {routine.timeout_s:g} s"
             self.supervisor.trip(Trip(Protection.RESET, Category.BRAKE_HOLD, cause, self._routine_ends_ns))
-            return self._zero
+            return self._motion.rest
         return velocity
 
     # -- the operator ---------------------------------------------------------------------------------------------
@@ -306,8 +257,6 @@ class Loop:
                 if supervisor.handle(Event.ACK) is State.SILENT:
                     self._arm.disable()
                     self._selftest()
-                else:
-                    self._reference.resync(self._reference.position, self._reference.velocity)
             case Verb.SELFTEST:
                 self._selftest()
             case Verb.ESTOP:
@@ -329,15 +278,14 @@ class Loop:
 
     def _enable(self, now: int) -> None:
         # Drives that come on hold with the last feed-forward they were given.
-        position = self._arm.read().position
-        self._arm.write(Command(CommandMode.TRACK, position, self._zero, self.kinematics.gravity(position)))
+        self._arm.write(self._motion.begin(self._arm.read().position))
         try:
             self._arm.enable()
         except RobotctlError as error:
             self.supervisor.trip(Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), now))
             raise
         sample = self._arm.read()
-        self._reference.resync(sample.position, self._zero)
+        self._motion.begin(sample.position)
         self.supervisor.begin_recovery_if_outside(sample, self.kinematics.tool(sample.position))
 
     def _close(self, now: int) -> None:
@@ -352,58 +300,3 @@ class Loop:
     def _serve_estop(self, source: str, now: int) -> None:
         cause = f"emergency stop by {source}; release it, then acknowledge"
         self.supervisor.trip(Trip(Protection.ESTOP, Category.BRAKE_OFF, cause, now))
-
-    # -- publishing -----------------------------------------------------------------------------------------------
-
-    def _report(self, now: int) -> None:
-        supervisor = self.supervisor
-        events = self._link.events
-        for trip in supervisor.trips[self._reported :]:
-            events.write(
-                {
-                    "type": "trip",
-                    "stamp_ns": now,
-                    "protection": trip.protection.label,
-                    "stop_category": int(trip.category),
-                    "reaction_ms": round((self._clock.now_ns() - trip.onset_ns) / 1e6, 3),
-                    "text": trip.cause,
-                }
-            )
-        self._reported = len(supervisor.trips)
-        if supervisor.state is not self._state:
-            text = f"{self._state.name} -> {supervisor.state.name}"
-            events.write({"type": "state", "stamp_ns": now, "state": supervisor.state.name, "text": text})
-            self._state = supervisor.state
-
-    def _publish(self, sample: Sample, tool: Vector, now: int) -> None:
-        supervisor, command, ring = self.supervisor, self._command, self._link.ticks
-        truth = self._arm.truth()
-        true = truth or self._no_truth
-        ring.fill(
-            self._ticks,
-            (
-                self._ticks,
-                now,
-                self.lateness_ns,
-                supervisor.epoch,
-                supervisor.admission.seq,
-                supervisor.state,
-                self._clip,
-                truth is not None,
-            ),
-            (
-                sample.position,
-                sample.velocity,
-                sample.effort,
-                self._wanted,
-                command.position,
-                command.velocity,
-                command.effort,
-                tool,
-                true.position,
-                true.velocity,
-                true.tool,
-            ),
-        )
-        ring.publish(self._ticks, self._clock.now_ns() - now)
-        self._ticks += 1

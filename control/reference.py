@@ -37,10 +37,11 @@ class Reference:
         self._rubs = bool(kinematics.friction.any())
 
     def resync(self, position: Vector, velocity: Vector) -> None:
-        """Start anew from a state: measured after any loss of hold, the reference's own while the drives hold."""
+        """Start anew from a measured state, as after any loss of hold. What the integrator had found is forgotten."""
         self.position = np.array(position)
         self.velocity = np.minimum(np.maximum(velocity, -self._velocity_cap), self._velocity_cap)
         self.acceleration = np.zeros_like(self.position)
+        self._bias = np.zeros_like(self.position)
 
     def step(self, velocity: Vector, measured: Vector) -> Command:
         """Advance one servo period to `velocity` and return the command for it.

@@ -402,7 +402,7 @@ def test_a_torque_target_rides_on_gravity_and_is_rate_limited(bench):
     torque[3] = 6.0
     gravity = bench.loop.kinematics.gravity
     step = bench.robot.limits.torque_rate * 2e-3
-    previous = bench.loop._command.effort
+    previous = bench.loop._motion.command.effort
     for _ in range(8):
         bench.put(JointTorque, torque)
         bench.tick()

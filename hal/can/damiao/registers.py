@@ -104,7 +104,7 @@ REGISTERS: dict[int, RegisterInfo] = {
     80: RegisterInfo("p_m", integer=False, writable=False),
     81: RegisterInfo("xout", integer=False, writable=False),
 }
-"""Vendor register list as used by openarm_can and python-damiao-driver; 56 and 59 to 65 exist on newer firmware only."""
+"""Vendor register list as in openarm_can and python-damiao-driver; 56 and 59 to 65 exist on newer firmware only."""
 
 
 def decode_value(register: int, raw: bytes) -> float:

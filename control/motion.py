@@ -1,0 +1,78 @@
+"""From what is wanted to the command for the drives: limit, shape, lead the reference, feed forward.
+
+Holds everything that has a memory between two ticks of motion, and nothing that decides whether to move.
+"""
+
+import numpy as np
+
+from robotctl.control.kinematics import Kinematics
+from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
+from robotctl.control.reference import Reference
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Command, CommandMode, Sample, Vector
+from robotctl.safety.shaper import Clip, Shaper
+from robotctl.safety.torque import StoppableMotion
+from robotctl.safety.trip import Trip
+
+
+class Motion:
+    """Makes one command per tick. `wanted`, `clip` and `command` tell of the last one."""
+
+    def __init__(self, robot: Robot, kinematics: Kinematics) -> None:
+        self.rest = np.zeros(robot.dof)
+        """What is wanted of an arm that is to brake and stay."""
+        self.reference = Reference(robot, kinematics)
+        self.wanted: Vector = self.rest
+        self.clip = Clip.NONE
+        self.command = Command(CommandMode.TRACK, self.rest, self.rest, self.rest)
+        self._kinematics = kinematics
+        self._limiter = VelocityLimiter(robot)
+        self._shaper = Shaper(robot, kinematics)
+        self._torque_limiter = TorqueLimiter(robot)
+        self._stoppable = StoppableMotion(robot, kinematics)
+        self._torque: Vector | None = None
+
+    def begin(self, position: Vector) -> Command:
+        """Return the command that holds a measured pose, and lead on from there."""
+        self.reference.resync(position, self.rest)
+        return Command(CommandMode.TRACK, position, self.rest, self._kinematics.gravity(position))
+
+    def track(self, wanted: Vector, sample: Sample, *, brake: bool) -> Command:
+        """Return the command for joint velocities (n,), rad/s; with `brake`, for stopping as fast as the caps allow."""
+        reference = self.reference
+        if self._torque is not None:
+            self._torque = None
+            reference.resync(sample.position, sample.velocity)
+        if wanted is self.rest and not reference.velocity.any():
+            velocity, self.clip = self.rest, Clip.NONE  # at rest, to stay so: outside the limits, too
+        else:
+            if brake:
+                limited = self._shaper.brake(reference.velocity)
+            else:
+                limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
+            tool, jacobian = self._kinematics.tool_and_jacobian(reference.position)
+            velocity, self.clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
+        self.wanted = wanted
+        self.command = reference.step(velocity, sample.position)
+        return self.command
+
+    def push(self, torque: Vector, sample: Sample) -> Command | Trip:
+        """Return the command for torques (n,), Nm, on top of gravity compensation.
+
+        Or a trip, if braking from the measured motion would end outside a limit: then nothing but `track` may follow.
+        """
+        trip = self._stoppable.check(sample)
+        if trip is not None:
+            return trip
+        previous = self.command.effort if self._torque is None else self._torque
+        self._torque = self._torque_limiter.step(self._kinematics.gravity(sample.position) + torque, previous)
+        self.reference.resync(sample.position, sample.velocity)
+        self.wanted, self.clip = torque, Clip.NONE
+        self.command = Command(CommandMode.EFFORT, sample.position, self.rest, self._torque)
+        return self.command
+
+    def damp(self, position: Vector, share: float) -> Command:
+        """Return the command that damps the joints with a share of their gravity compensated."""
+        self.wanted, self.clip = self.rest, Clip.NONE
+        self.command = Command(CommandMode.DAMP, position, self.rest, share * self._kinematics.gravity(position))
+        return self.command
