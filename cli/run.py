@@ -45,7 +45,7 @@ def run(
         list[str] | None, typer.Option("--set", help="Override a profile key, e.g. twin.lag_s=0.02.")
     ] = None,
 ) -> None:
-    """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C stops and parks."""
+    """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C brakes, parks an arm that has no brakes, and switches off."""
     console = Console(highlight=False, soft_wrap=True)
     overrides = list(set_ or [])
     with readable_errors():
@@ -110,12 +110,17 @@ def _run(
                 with stop_keys(session.emergency_stop):
                     outcome = run_episodes(session, actor, task, episodes, seed, on_episode)
                 status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
-            except (KeyboardInterrupt, Terminated) as interruption:
-                kind = Verb.DISARM if isinstance(interruption, KeyboardInterrupt) else Verb.ESTOP
-                status = Exit.INTERRUPTED if isinstance(interruption, KeyboardInterrupt) else Exit.STOPPED_BY_SAFETY
-                outcome.stopped = "interrupted" if kind is Verb.DISARM else "emergency stop by SIGTERM"
-                console.print(f"  {outcome.stopped}: braking, then drives off")
-                session.bring_to_rest(kind)
+            except KeyboardInterrupt:
+                status, outcome.stopped = Exit.INTERRUPTED, "interrupted"
+                console.print("  interrupted: braking, then drives off; Ctrl-C again for drives off at once")
+                try:
+                    session.wind_down()
+                except KeyboardInterrupt:
+                    session.bring_to_rest(Verb.DISARM)
+            except Terminated:
+                status, outcome.stopped = Exit.STOPPED_BY_SAFETY, "emergency stop by SIGTERM"
+                console.print(f"  {outcome.stopped}")
+                session.bring_to_rest(Verb.ESTOP)
             state = session.state.name
         result = report(session, outcome, about, recording)
         result["safety"]["state"] = state

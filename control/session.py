@@ -189,6 +189,17 @@ class Session(ABC):
             self.request(Verb.DISARM)
             self._wait(lambda: self.state in (State.READY, State.FAULT), 10.0, "the drives did not go off")
 
+    def wind_down(self) -> None:
+        """End what is going on, by the operator's word: brake, park where drives may go off, switch them off.
+
+        An arm with brakes is not parked: it stays where it is.
+        """
+        if self.state in (State.RUN, State.RESET, State.ARMED) and not self.robot.profile.brakes:
+            self.end()
+            self.finish()
+        else:
+            self.bring_to_rest(Verb.DISARM)
+
     def emergency_stop(self) -> None:
         """Ask for an emergency stop, without waiting. May be called from any thread."""
         self.link.desk.ask(Verb.ESTOP)

@@ -91,9 +91,10 @@ def test_an_operator_that_is_killed_takes_the_arm_down_with_it(start: Any) -> No
     assert run.left_behind() == []
 
 
+@pytest.mark.parametrize("robot", ["panda", "openarm"])
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 3)])
-def test_signals_to_the_operator_stop_the_arm(start: Any, number: signal.Signals, status: int) -> None:
-    run = start(*LONG)
+def test_signals_to_the_operator_stop_the_arm(start: Any, robot: str, number: signal.Signals, status: int) -> None:
+    run = start("--robot", robot, *LONG)
     run.wait_running()
     run.process.send_signal(number)
     ended, output, report = run.finish()

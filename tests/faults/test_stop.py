@@ -1,6 +1,10 @@
 """`robotctl stop` from another terminal, and policies that misbehave, in real time."""
 
+import json
+import os
+import pty
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -43,3 +47,21 @@ def test_a_treacherous_policy_is_stopped_and_recorded(start: Any, backend: str, 
             message.data for _, channel, message in make_reader(file).iter_messages() if channel.topic == "/event"
         ]
     assert any(protection.encode() in event for event in events)
+
+
+@pytest.mark.parametrize("key", [b" ", b"\x1b"])
+def test_one_key_is_the_emergency_stop(tmp_path: Path, key: bytes) -> None:
+    master, slave = pty.openpty()
+    report = tmp_path / "report.json"
+    command = [*ROBOTCTL, "run", "--policy", "random", "--episodes", "4"]
+    command += ["--json", str(report), "--record", str(tmp_path / "run.mcap")]
+    run = subprocess.Popen(command, stdin=slave, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    os.close(slave)
+    time.sleep(4.0)
+    os.write(master, key)
+    output, _ = run.communicate(timeout=30)
+    os.close(master)
+    assert run.returncode == 3, output
+    trip = json.loads(report.read_text())["safety"]["trips"][0]
+    assert (trip["protection"], trip["stop_category"]) == ("P23", 1)
+    assert trip["reaction_ms"] < 20.0
