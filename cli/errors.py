@@ -25,6 +25,8 @@ def readable_errors() -> Iterator[None]:
     """Turn this package's errors into a message on stderr and an exit status."""
     try:
         yield
+    except KeyboardInterrupt:
+        raise typer.Exit(Exit.INTERRUPTED) from None
     except RobotctlError as error:
         console = Console(stderr=True, soft_wrap=True, highlight=False)
         console.print(

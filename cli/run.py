@@ -1,6 +1,9 @@
 """`robotctl run`: let a policy work on a task, on the twin or on hardware."""
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -16,6 +19,7 @@ from robotctl.control.loop import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.recording_session import record_session
 from robotctl.control.session import LockstepSession, Session
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.profile import CLASSIC_HZ
 from robotctl.hal.robot import load_robot
 from robotctl.learning.actor import Actor, InlineActor, ProcessActor
@@ -45,7 +49,7 @@ def run(
         list[str] | None, typer.Option("--set", help="Override a profile key, e.g. twin.lag_s=0.02.")
     ] = None,
 ) -> None:
-    """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C brakes, parks an arm that has no brakes, and switches off."""
+    """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C brakes, and then switches off."""
     console = Console(highlight=False, soft_wrap=True)
     overrides = list(set_ or [])
     with readable_errors():
@@ -55,7 +59,8 @@ def run(
             model = load_robot(robot, overrides)
             console.print(f"slcan carries classic CAN only: servo rate {CLASSIC_HZ} Hz")
         work = load_task(task)
-        about = {"backend": backend, "robot": model.profile.name, "task": work.name, "policy": policy, "seed": seed}
+        if policy not in POLICIES:
+            raise ConfigError(f"unknown policy {policy!r}", f"use one of {', '.join(POLICIES)}")
         session: Session
         actor: Actor
         if fast:
@@ -64,70 +69,84 @@ def run(
         else:
             session = ProcessSession(model, backend, channel, overrides)
             actor = ProcessActor(session, work, policy, seed, overrides)
-        path = record or Path("recordings") / f"{datetime.now():%Y%m%d-%H%M%S}-{model.profile.name}-{backend}.mcap"
+        name = model.profile.name
+        about = {"backend": backend, "robot": name, "task": work.name, "policy": policy, "seed": seed}
+        path = record or Path("recordings") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}-{backend}.mcap"
         console.print(
             f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}"
         )
-        outcome, result = _run(console, session, actor, path, about, overrides, episodes, seed, work)
+        job = Job(session, actor, work, episodes, seed, path, about, overrides)
+        status, result = _carry_out(job, console)
         _summarise(console, result)
         if json is not None:
             write_json(json, result)
-    if outcome == Exit.DONE:
-        return
-    raise typer.Exit(outcome)
+    if status is not Exit.DONE:
+        raise typer.Exit(status)
 
 
-def _run(
-    console: Console,
-    session: Session,
-    actor: Actor,
-    path: Path,
-    about: dict[str, Any],
-    overrides: list[str],
-    episodes: int,
-    seed: int,
-    task: ReachTask,
-) -> tuple[Exit, dict[str, Any]]:
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What is to be run, and where it is recorded."""
+
+    session: Session
+    actor: Actor
+    task: ReachTask
+    episodes: int
+    seed: int
+    path: Path
+    about: dict[str, Any]
+    overrides: list[str]
+
+
+def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any]]:
+    """Run a job to its end, or to wherever a person or a signal ends it."""
+
     def on_episode(index: int, episode: Episode) -> None:
         mark = "[green]reached[/]" if episode.success else "[yellow]missed[/] "
-        console.print(
-            f"  episode {index + 1}  {mark}  {1e3 * episode.final_distance_m:7.1f} mm  {episode.steps:4d} steps"
-        )
+        distance = f"{1e3 * episode.final_distance_m:7.1f} mm"
+        console.print(f"  episode {index + 1}  {mark}  {distance}  {episode.steps:4d} steps")
 
     def on_trip(event: dict[str, Any]) -> None:
         console.print(f"  [bold red]stop[/] {event['protection']} (category {event['stop_category']})", end=": ")
         console.print(event["text"], markup=False)
 
+    session, outcome, status = job.session, Outcome(), Exit.DONE
+    recorded = record_session(session, job.path, job.about, on_trip, job.overrides)
+    with _terminable(), session, recorded as recording, job.actor as actor:
+        try:
+            with stop_keys(session.emergency_stop):
+                run_episodes(session, actor, job.task, job.episodes, job.seed, outcome, on_episode)
+            status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
+        except KeyboardInterrupt:
+            status, outcome.stopped = Exit.INTERRUPTED, "interrupted"
+            console.print("  interrupted: braking, then drives off; Ctrl-C again for drives off at once")
+            try:
+                session.wind_down()
+            except KeyboardInterrupt:
+                session.bring_to_rest(Verb.DISARM)
+        except Terminated:
+            status, outcome.stopped = Exit.STOPPED_BY_SAFETY, "emergency stop by SIGTERM"
+            console.print(f"  {outcome.stopped}")
+            session.bring_to_rest(Verb.ESTOP)
+        state = session.state.name
+    result = report(session, outcome, job.about, recording)
+    result["safety"]["state"] = state
+    result["processes"] = recording.processes | {"policy": actor.pid}
+    return status, result
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Raise `Terminated` in the main thread on SIGTERM."""
+
     def terminate(_signal: int, _frame: FrameType | None) -> None:
         raise Terminated
 
-    status = Exit.DONE
-    outcome = Outcome()
     before = signal.signal(signal.SIGTERM, terminate)
     try:
-        with session, record_session(session, path, about, on_trip, overrides) as recording, actor:
-            try:
-                with stop_keys(session.emergency_stop):
-                    outcome = run_episodes(session, actor, task, episodes, seed, on_episode)
-                status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
-            except KeyboardInterrupt:
-                status, outcome.stopped = Exit.INTERRUPTED, "interrupted"
-                console.print("  interrupted: braking, then drives off; Ctrl-C again for drives off at once")
-                try:
-                    session.wind_down()
-                except KeyboardInterrupt:
-                    session.bring_to_rest(Verb.DISARM)
-            except Terminated:
-                status, outcome.stopped = Exit.STOPPED_BY_SAFETY, "emergency stop by SIGTERM"
-                console.print(f"  {outcome.stopped}")
-                session.bring_to_rest(Verb.ESTOP)
-            state = session.state.name
-        result = report(session, outcome, about, recording)
-        result["safety"]["state"] = state
-        result["processes"] = recording.processes | {"policy": actor.pid}
+        yield
     finally:
         signal.signal(signal.SIGTERM, before)
-    return status, result
 
 
 def _summarise(console: Console, result: dict[str, Any]) -> None:

@@ -80,7 +80,11 @@ class Session(ABC):
         """Return the bus counters of `Arm.bus_statistics`."""
 
     def __enter__(self) -> Self:
-        self.open()
+        try:
+            self.open()
+        except BaseException:  # an interrupt, too, must not leave a half-open session
+            self.close()
+            raise
         return self
 
     def __exit__(

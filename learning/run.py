@@ -42,16 +42,19 @@ def run_episodes(
     task: ReachTask,
     episodes: int,
     seed: int,
+    outcome: Outcome,
     on_episode: Callable[[int, Episode], None] = lambda *_: None,
-) -> Outcome:
+) -> None:
     """Run episodes until they are done or safety ends the run; on return the arm is at rest.
 
     After a stop that safety latched, nothing moves again: the drives go off where the arm stands.
 
+    Args:
+        outcome: filled as the run goes on, so that an interruption leaves what was reached so far.
+
     Raises:
         HardwareError: if the control loop died.
     """
-    outcome = Outcome()
     kinematics = Kinematics(session.robot)
     rate = _RateMeter()
     try:
@@ -71,8 +74,8 @@ def run_episodes(
         session.poll()
         outcome.stopped = _reason(session, actor) or error.what
         session.bring_to_rest(Verb.DISARM)
-    outcome.policy_hz = rate.hz
-    return outcome
+    finally:
+        outcome.policy_hz = rate.hz
 
 
 def _run_episode(session: Session, actor: Actor, task: ReachTask, goal: Vector, rate: "_RateMeter") -> Episode:

@@ -8,7 +8,7 @@ from robotctl.control.session import LockstepSession, Stopped
 from robotctl.hal.errors import HardwareError
 from robotctl.hal.robot import load_robot
 from robotctl.learning.actor import InlineActor
-from robotctl.learning.run import run_episodes
+from robotctl.learning.run import Outcome, run_episodes
 from robotctl.learning.task import load_task
 from robotctl.safety.machine import State
 from robotctl.safety.target import JointVelocity
@@ -19,7 +19,8 @@ NOISY = ["twin.noise_position=1e-4", "twin.noise_velocity=1e-3", "twin.lag_s=0.0
 def records_of(name, backend, policy, seed, overrides=()):
     task = load_task("reach").model_copy(update={"steps": 20})
     with LockstepSession(load_robot(name, list(overrides)), backend) as session:
-        outcome = run_episodes(session, InlineActor(session, task, policy, seed), task, 1, seed)
+        outcome = Outcome()
+        run_episodes(session, InlineActor(session, task, policy, seed), task, 1, seed, outcome)
         records, _, dropped = session.link.ticks.since(0)
         assert dropped == 0
         assert len(records) == session.statistics.ticks > 500

@@ -10,7 +10,7 @@ from robotctl.control.recording_session import SessionRecording
 from robotctl.control.session import LockstepSession
 from robotctl.hal.robot import load_robot, robot_names
 from robotctl.learning.actor import InlineActor
-from robotctl.learning.run import report, run_episodes
+from robotctl.learning.run import Outcome, report, run_episodes
 from robotctl.learning.task import load_task
 from robotctl.safety.machine import State
 
@@ -26,7 +26,8 @@ def result_of(name, backend, policy="scripted", steps=150, episodes=EPISODES):
     about = {"backend": backend, "robot": name, "task": task.name, "policy": policy, "seed": SEED}
     with LockstepSession(load_robot(name), backend) as session:
         actor = InlineActor(session, task, policy, SEED)
-        outcome = run_episodes(session, actor, task, episodes, SEED)
+        outcome = Outcome()
+        run_episodes(session, actor, task, episodes, SEED, outcome)
         made = report(session, outcome, about, SessionRecording(Path("nowhere.mcap")))
     return outcome, json.loads(json.dumps(made, allow_nan=False))
 
@@ -127,7 +128,8 @@ def test_an_arm_that_does_not_follow_ends_the_run_and_says_why():
         actor.step = jam
         # The scripted policy hardly minds a joint that is stuck; an outward one asks it to move.
         actor._policy = InlineActor(session, task, "outward", 0)._policy
-        outcome = run_episodes(session, actor, task, 1, 0)
+        outcome = Outcome()
+        run_episodes(session, actor, task, 1, 0, outcome)
         assert "P17" in outcome.stopped
         assert "panda_joint2" in outcome.stopped
         assert session.state is State.FAULT
