@@ -5,7 +5,7 @@ law inside its own step, so a drive's feedback loop runs at the physics rate wha
 The sim backend and the emulated motors stand in front of the same plant; they differ in how a command reaches it.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -93,6 +93,8 @@ class Plant:
         """Set the law that an enabled drive follows from now on (joint coordinates, SI)."""
         actuator = self._addresses[axis][2]
         bias = self._bias_rows[axis]
+        if self._lagged and axis < self.dof:
+            self._keep_torque(axis, kp + bias[1], kd + bias[2])
         bias[1] = -kp
         bias[2] = -kd
         if self._braked[axis]:
@@ -104,9 +106,16 @@ class Plant:
         """Set the law of all arm joints at once; arrays are (n,)."""
         n = self.dof
         bias = self.model.actuator_biasprm
+        if self._lagged:
+            self._keep_torque(slice(n), kp + bias[:n, 1], kd + bias[:n, 2])
         bias[:n, 1] = -kp
         bias[:n, 2] = -kd
         self.data.ctrl[:n] = kp * position + kd * velocity + effort
+
+    def _keep_torque(self, axes: int | slice, more_kp: Any, more_kd: Any) -> None:
+        """Let the torque go on from where it is when gains change: what lags is the command, not the new gains."""
+        data = self.data
+        data.act[axes] += more_kp * data.qpos[axes] + more_kd * data.qvel[axes]
 
     def settle_lag(self, axis: int) -> None:
         """Let the lag of an axis start from its present command, as a drive does that was just enabled."""

@@ -1,0 +1,97 @@
+"""The plant: the drive law, brakes, payload and external torques, against closed forms where there are any."""
+
+import numpy as np
+import pytest
+
+from robotctl.control.kinematics import Kinematics
+from robotctl.hal.robot import Robot, load_robot
+from robotctl.sim.plant import PHYSICS_STEP_NS, Plant
+
+MS = 1_000_000
+
+
+def held(robot: Robot) -> Plant:
+    """A plant whose drives hold the home pose with gravity compensated."""
+    plant = Plant(robot)
+    home = np.array(robot.profile.home)
+    plant.place(home)
+    gravity = Kinematics(robot).gravity(home)
+    for axis, joint in enumerate(robot.profile.joints):
+        plant.drive(axis, joint.gains.kp, joint.gains.kd, home[axis], 0.0, gravity[axis])
+        plant.settle_lag(axis)
+    return plant
+
+
+def test_time_moves_in_whole_steps(panda: Robot) -> None:
+    plant = Plant(panda, start_ns=5)
+    plant.advance(5 + PHYSICS_STEP_NS - 1)
+    assert plant.time_ns == 5
+    plant.advance(5 + 3 * PHYSICS_STEP_NS + 1)
+    assert plant.time_ns == 5 + 3 * PHYSICS_STEP_NS
+    plant.advance(0)
+    assert plant.time_ns == 5 + 3 * PHYSICS_STEP_NS
+
+
+def test_a_held_arm_stays(robot: Robot) -> None:
+    plant = held(robot)
+    plant.advance(1000 * MS)
+    assert np.abs(plant.truth().position - robot.profile.home).max() < 2e-3
+
+
+def test_an_arm_lies_in_its_cradle_until_its_drives_come_on(robot: Robot) -> None:
+    plant = Plant(robot)
+    plant.advance(2000 * MS)
+    assert np.abs(plant.truth().position - robot.profile.rest).max() < 1e-2
+
+
+@pytest.mark.parametrize(("name", "falls"), [("panda", False), ("openarm", True)])
+def test_without_torque_brakes_hold_and_others_fall(name: str, falls: bool) -> None:
+    robot = load_robot(name)
+    plant = held(robot)
+    plant.advance(10 * MS)
+    for axis in range(robot.dof):
+        plant.release(axis)
+    plant.advance(1000 * MS)
+    moved = np.abs(plant.truth().position - robot.profile.home).max()
+    assert bool(moved > 0.2) is falls
+
+
+def test_the_drive_law_is_kp_kd_and_feed_forward(panda: Robot) -> None:
+    plant = held(panda)
+    plant.drive(0, 10.0, 2.0, 0.3, 0.5, 1.5)
+    plant.advance(PHYSICS_STEP_NS)
+    state = plant.axis(0)
+    expected = 10.0 * (0.3 - state.position) + 2.0 * (0.5 - state.velocity) + 1.5
+    assert state.effort == pytest.approx(expected, rel=0.05)
+
+
+def test_torque_is_clipped_to_the_profile(panda: Robot) -> None:
+    plant = held(panda)
+    plant.drive(0, 0.0, 0.0, 0.0, 0.0, 500.0)
+    plant.advance(PHYSICS_STEP_NS)
+    assert plant.axis(0).effort == panda.limits.torque[0]
+
+
+def test_a_payload_weighs_on_the_drives() -> None:
+    light, heavy = load_robot("panda"), load_robot("panda", ["twin.payload=1.0"])
+    plants = [held(robot) for robot in (light, heavy)]
+    for plant in plants:
+        plant.advance(3000 * MS)
+    sag = plants[0].truth().tool[2] - plants[1].truth().tool[2]
+    assert sag > 0.01
+    jacobian = Kinematics(light).tool_and_jacobian(plants[1].truth().position)[1]
+    load = plants[1].truth().effort - Kinematics(light).gravity(plants[1].truth().position)
+    np.testing.assert_allclose(load, -jacobian.T @ [0.0, 0.0, -9.81], atol=0.3)
+
+
+def test_a_push_moves_the_arm_and_ends(panda: Robot) -> None:
+    plant = held(panda)
+    effort = np.zeros(7)
+    effort[0] = 20.0
+    plant.push(effort)
+    plant.advance(300 * MS)
+    pushed = plant.truth().position[0]
+    assert pushed > 0.05
+    plant.push(np.zeros(7))
+    plant.advance(3000 * MS)
+    assert plant.truth().position[0] < 0.5 * pushed
