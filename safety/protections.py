@@ -30,7 +30,7 @@ class PositionBreach:
     def check(self, sample: Sample) -> Trip | None:
         beyond = np.abs(sample.position - self._middle) - self._half
         joint = int(beyond.argmax())
-        if not beyond[joint] > 0.0:
+        if beyond[joint] <= 0.0:  # in this direction, so that NaN trips, too
             return None
         where = f"{self._names[joint]} measured at {sample.position[joint]:.3f} rad, outside its limits"
         return Trip(Protection.POSITION, Category.BRAKE_OFF, f"{where}; acknowledge, then retreat", sample.stamp_ns)
@@ -51,7 +51,7 @@ class SphereBreach:
 
     def check(self, tool: Vector, stamp_ns: int) -> Trip | None:
         outside = self.outside(tool)
-        if not outside > self._breach:
+        if outside <= self._breach:
             return None
         cause = f"tool measured {1e3 * outside:.0f} mm outside its sphere; acknowledge, then retreat"
         return Trip(Protection.SPHERE, Category.BRAKE_HOLD, cause, stamp_ns)
@@ -91,7 +91,7 @@ class TrackingError:
     def check(self, sample: Sample, reference: Vector) -> Trip | None:
         error = np.abs(reference - sample.position)
         joint = int(error.argmax())
-        if not error[joint] > self._largest:
+        if error[joint] <= self._largest:
             return None
         cause = (
             f"{self._names[joint]} is {error[joint]:.3f} rad away from where it was led; "

@@ -30,10 +30,10 @@ class StoppableMotion:
         beyond = np.maximum(stop - self._limits.upper, self._limits.lower - stop)
         fast = speed - self._limits.velocity
         joint = int(beyond.argmax())
-        if beyond[joint] > 0.0:
+        if not beyond[joint] <= 0.0:  # in this direction, so that NaN trips, too
             return self._trip(f"{self._names[joint]} would stop {beyond[joint]:.3f} rad outside its limits", sample)
         joint = int(fast.argmax())
-        if fast[joint] > 0.0:
+        if not fast[joint] <= 0.0:
             return self._trip(f"{self._names[joint]} moves at {speed[joint]:.2f} rad/s, over its cap", sample)
         if min(self._sphere.room(self._tool(stop)), self._sphere.room(self._tool(sample.position + 0.5 * ahead))) < 0.0:
             return self._trip("the tool would stop outside its sphere", sample)

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from robotctl.control.kinematics import Kinematics
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Fault, Sample
 from robotctl.safety.protections import DriveHealth, FeedbackAge, PositionBreach, SphereBreach, TrackingError
+from robotctl.safety.torque import StoppableMotion
 from robotctl.safety.trip import Category, Protection
 
 STEPS = [-1e-3, -1e-6, -1e-9, 1e-9, 1e-6, 1e-3, 1.0]
@@ -137,3 +139,18 @@ def test_drive_health():
     for expect in (True, False):
         trip = check.check(sample(rest, faults=faults), expect_enabled=expect)
         assert trip.cause == "joint2: drive reports COMMUNICATION_LOST (code 0xD); look at the cable"
+
+
+@pytest.mark.parametrize("field", ["position", "velocity"])
+def test_a_measurement_that_is_no_number_is_never_fine(field: str) -> None:
+    robot = load_robot("panda")
+    home = np.array(robot.profile.home)
+    sample = Sample(0, home, np.zeros(7), np.zeros(7), np.zeros(7, np.int64), (), True)
+    bad = np.array(getattr(sample, field))
+    bad[3] = np.nan
+    sample = sample._replace(**{field: bad})
+    assert StoppableMotion(robot, Kinematics(robot)).check(sample) is not None
+    if field == "position":
+        assert PositionBreach(robot).check(sample) is not None
+        assert TrackingError(robot).check(sample, home) is not None
+        assert SphereBreach(robot).check(np.array([np.nan, 0.0, 0.0]), 0) is not None
