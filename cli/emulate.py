@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from robotctl.cli.errors import Exit, readable_errors
+from robotctl.cli.errors import Exit, hear_interrupts, readable_errors
 from robotctl.cli.output import write_json
 from robotctl.hal.can.damiao.faults import status_name
 from robotctl.hal.clock import MonotonicClock
@@ -45,6 +45,7 @@ def emulate(
     ] = None,
 ) -> None:
     """Serve emulated drives that speak the wire byte for byte, in real time, until Ctrl-C (exit status 130)."""
+    hear_interrupts()
     with readable_errors():
         clock = MonotonicClock()
         loaded = load_robot(robot)

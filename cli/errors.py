@@ -1,5 +1,6 @@
 """Exit statuses, and errors as a person should see them."""
 
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -18,6 +19,12 @@ class Exit(IntEnum):
     STOPPED_BY_SAFETY = 3
     NO_HARDWARE = 4
     INTERRUPTED = 130
+
+
+def hear_interrupts() -> None:
+    """Listen to SIGINT even where a shell that started us in the background had it ignored: an arm has to stop."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from robotctl.cli.errors import Exit, readable_errors
+from robotctl.cli.errors import Exit, hear_interrupts, readable_errors
 from robotctl.cli.keys import stop_keys
 from robotctl.cli.output import write_json
 from robotctl.control.loop import Verb
@@ -52,6 +52,7 @@ def run(
     """Let a policy work on a task. Space or Esc is the emergency stop; Ctrl-C brakes, and then switches off."""
     console = Console(highlight=False, soft_wrap=True)
     overrides = list(set_ or [])
+    hear_interrupts()
     with readable_errors():
         model = load_robot(robot, overrides)
         if channel.startswith("slcan:") and model.profile.servo_hz > CLASSIC_HZ:
