@@ -77,7 +77,10 @@ def run(
             f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}"
         )
         job = Job(session, actor, work, episodes, seed, path, about, overrides)
-        status, result = _carry_out(job, console)
+        try:
+            status, result = _carry_out(job, console)
+        except Terminated:  # before anything moved, or after everything had come to rest
+            raise typer.Exit(Exit.STOPPED_BY_SAFETY) from None
         _summarise(console, result)
         if json is not None:
             write_json(json, result)
@@ -114,26 +117,41 @@ def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any]]:
     session, outcome, status = job.session, Outcome(), Exit.DONE
     recorded = record_session(session, job.path, job.about, on_trip, job.overrides)
     with _terminable(), session, recorded as recording, job.actor as actor:
-        try:
-            with stop_keys(session.emergency_stop):
-                run_episodes(session, actor, job.task, job.episodes, job.seed, outcome, on_episode)
-            status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
-        except KeyboardInterrupt:
-            status, outcome.stopped = Exit.INTERRUPTED, "interrupted"
-            console.print("  interrupted: braking, then drives off; Ctrl-C again for drives off at once")
+        with _stopped_by_errors(session), stop_keys(session.emergency_stop):
             try:
-                session.wind_down()
-            except KeyboardInterrupt:
-                session.bring_to_rest(Verb.DISARM)
-        except Terminated:
-            status, outcome.stopped = Exit.STOPPED_BY_SAFETY, "emergency stop by SIGTERM"
-            console.print(f"  {outcome.stopped}")
-            session.bring_to_rest(Verb.ESTOP)
+                try:
+                    run_episodes(session, actor, job.task, job.episodes, job.seed, outcome, on_episode)
+                    status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
+                except KeyboardInterrupt:
+                    status, outcome.stopped = Exit.INTERRUPTED, "interrupted"
+                    console.print("  interrupted: braking, then drives off; Ctrl-C again for drives off at once")
+                    _wind_down(session)
+            except Terminated:
+                status, outcome.stopped = Exit.STOPPED_BY_SAFETY, "emergency stop by SIGTERM"
+                console.print(f"  {outcome.stopped}")
+                session.bring_to_rest(Verb.ESTOP)
         state = session.state.name
     result = report(session, outcome, job.about, recording)
     result["safety"]["state"] = state
     result["processes"] = recording.processes | {"policy": actor.pid}
     return status, result
+
+
+def _wind_down(session: Session) -> None:
+    try:
+        session.wind_down()
+    except KeyboardInterrupt:
+        session.bring_to_rest(Verb.DISARM)
+
+
+@contextmanager
+def _stopped_by_errors(session: Session) -> Iterator[None]:
+    """Stop the arm first when anything goes wrong here: policy and recorder take their time to end."""
+    try:
+        yield
+    except BaseException:
+        session.emergency_stop()
+        raise
 
 
 @contextmanager

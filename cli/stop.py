@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,8 @@ def stop(
     console = Console(highlight=False, soft_wrap=True)
     targets = [entry for entry in registry.running() if robot in ("", entry.robot)]
     for entry in targets:
-        os.kill(entry.pid, signal.SIGUSR1)
+        with suppress(ProcessLookupError):  # one that has just ended must not keep the others from being stopped
+            os.kill(entry.pid, signal.SIGUSR1)
     deadline = time.monotonic() + _TIMEOUT_S
     waiting = list(targets)
     while waiting and time.monotonic() < deadline:

@@ -25,6 +25,8 @@ from robotctl.safety.supervisor import Supervisor
 from robotctl.safety.target import FreeDrive, JointTorque, JointVelocity
 from robotctl.safety.trip import Category, Protection, Trip
 
+_LARGEST_GAP = 10
+"""Skipped periods that the reference follows; a longer gap shows as a tracking error."""
 _LOWERING_S = 2.0
 """Time over which gravity compensation fades before the drives of an arm without brakes go off."""
 
@@ -60,6 +62,8 @@ class Loop:
         self.closed = False
         self.lateness_ns = 0
         """How late the present tick began; set by whoever paces the loop."""
+        self.skipped = 0
+        """Servo periods that passed without a tick before the present one; set by whoever paces the loop."""
         self._arm = rig.arm
         self._gripper = rig.gripper
         self._clock = clock
@@ -114,6 +118,8 @@ class Loop:
         """Do everything that is due in one servo period."""
         now = self._clock.now_ns()
         supervisor = self.supervisor
+        if self._link.desk.take_stop():
+            self._serve_estop("the operator", now)
         if self._estop:
             source, self._estop = self._estop, ""
             self._serve_estop(source, now)
@@ -158,7 +164,8 @@ class Loop:
                 self._arm.write(pushed)
                 return
             supervisor.trip(pushed)
-        self._arm.write(motion.track(wanted, sample, brake=supervisor.category is Category.BRAKE_OFF))
+        periods = 1 + min(self.skipped, _LARGEST_GAP)
+        self._arm.write(motion.track(wanted, sample, brake=supervisor.category is Category.BRAKE_OFF, periods=periods))
 
     def _cut(self, sample: Sample, now: int) -> None:
         """The profile's category 0 action: drives off, or damped with gravity compensated until told otherwise."""
@@ -169,7 +176,7 @@ class Loop:
                 self._lowering_ns = now
             if self._damping and not clean:
                 self.supervisor.handle(Event.OFF_FAULT)
-        if self._damping and sample.enabled and not self.supervisor.feedback.stale:
+        if self._damping and sample.enabled and not self.supervisor.feedback.lost:
             fade = 1.0
             if self._lowering_ns is not None:
                 fade = 1.0 - (now - self._lowering_ns) / (_LOWERING_S * 1e9)
@@ -191,7 +198,7 @@ class Loop:
 
     def _routine_velocity(self, sample: Sample, now: int) -> Vector:
         routine = self._routine
-        if routine is None:
+        if routine is None or self.supervisor.feedback.stale:
             return self._motion.rest
         velocity = routine.velocity(sample, self._motion.reference.position)
         if velocity is None:

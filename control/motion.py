@@ -14,6 +14,11 @@ from robotctl.safety.shaper import Clip, Shaper
 from robotctl.safety.torque import StoppableMotion
 from robotctl.safety.trip import Trip
 
+_FASTEST = 3.0
+"""Multiple of a joint's velocity cap that a measurement may tell of and be believed."""
+_NOISE = 0.01
+"""rad"""
+
 
 class Motion:
     """Makes one command per tick. `wanted`, `clip` and `command` tell of the last one."""
@@ -31,30 +36,44 @@ class Motion:
         self._torque_limiter = TorqueLimiter(robot)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
+        self._farthest = _FASTEST * robot.limits.velocity * robot.period_ns * 1e-9 + _NOISE
+        """Way that a joint may have gone since the last sample (n,), rad; further, and the sample is not believed."""
 
     def begin(self, position: Vector) -> Command:
         """Return the command that holds a measured pose, and lead on from there."""
+        self._torque = None
         self.reference.resync(position, self.rest)
         return Command(CommandMode.TRACK, position, self.rest, self._kinematics.gravity(position))
 
-    def track(self, wanted: Vector, sample: Sample, *, brake: bool) -> Command:
-        """Return the command for joint velocities (n,), rad/s; with `brake`, for stopping as fast as the caps allow."""
+    def track(self, wanted: Vector, sample: Sample, *, brake: bool, periods: int = 1) -> Command:
+        """Return the command for joint velocities (n,), rad/s; with `brake`, for stopping as fast as the caps allow.
+
+        After a late tick `periods` says how many servo periods have passed since the last one: the drives went on
+        with the velocity they were given, and the reference has to go with them, proved step by step.
+        """
         reference = self.reference
         if self._torque is not None:
             self._torque = None
-            reference.resync(sample.position, sample.velocity)
-        if wanted is self.rest and not reference.velocity.any():
-            velocity, self.clip = self.rest, Clip.NONE  # at rest, to stay so: outside the limits, too
-        else:
-            if brake:
-                limited = self._shaper.brake(reference.velocity)
-            else:
-                limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
-            tool, jacobian = self._kinematics.tool_and_jacobian(reference.position)
-            velocity, self.clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
-        self.wanted = wanted
-        self.command = reference.step(velocity, sample.position)
+            # One broken frame must not become the pose that the drives are pulled to: then the last one stays.
+            if (np.abs(sample.position - reference.position) <= periods * self._farthest).all():
+                reference.resync(sample.position, sample.velocity)
+        self.wanted, self.clip = wanted, Clip.NONE
+        for _ in range(periods):
+            self.command = reference.step(self._shape(wanted, brake), sample.position)
         return self.command
+
+    def _shape(self, wanted: Vector, brake: bool) -> Vector:
+        reference = self.reference
+        if wanted is self.rest and not reference.velocity.any():
+            return self.rest  # at rest, to stay so: outside the limits, too
+        if brake:
+            limited = self._shaper.brake(reference.velocity)
+        else:
+            limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
+        tool, jacobian = self._kinematics.tool_and_jacobian(reference.position)
+        velocity, clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
+        self.clip |= clip
+        return velocity
 
     def push(self, torque: Vector, sample: Sample) -> Command | Trip:
         """Return the command for torques (n,), Nm, on top of gravity compensation.

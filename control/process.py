@@ -64,7 +64,10 @@ def main(text: str) -> int:
 
 
 def _run(loop: Loop, link: Link, clock: MonotonicClock, config: ProcessConfig) -> int:
+    claimed = None
     try:
+        if ":" in config.channel:  # others exist in this process only
+            claimed = registry.claim(config.channel)
         loop.bring_up()
         missing = go_real_time()
         text = f"real time without {' and '.join(missing)}" if missing else "real time: SCHED_FIFO, memory locked"
@@ -81,11 +84,13 @@ def _run(loop: Loop, link: Link, clock: MonotonicClock, config: ProcessConfig) -
             loop.shut_down()
         finally:
             link.events.write({"type": "bus", "stamp_ns": clock.now_ns(), "statistics": statistics})
+            if claimed is not None:
+                claimed.close()
     return 0
 
 
 def _pace(loop: Loop, clock: MonotonicClock, operator: int) -> None:
-    """Tick at absolute deadlines until the loop is closed. Missed deadlines are skipped, not caught up with."""
+    """Tick at absolute deadlines until the loop is closed. Missed deadlines are skipped, and the loop is told."""
     period = loop.robot.period_ns
     deadline = clock.now_ns() + period
     while not loop.closed:
@@ -94,8 +99,8 @@ def _pace(loop: Loop, clock: MonotonicClock, operator: int) -> None:
         loop.tick()
         if os.getppid() != operator and loop.supervisor.state in _CLOSABLE:
             loop.request(Verb.CLOSE)  # nobody is left who could ask for it
-        behind = clock.now_ns() - deadline
-        deadline += period * max(1, 1 + behind // period)
+        loop.skipped = max(0, (clock.now_ns() - deadline) // period)
+        deadline += period * (1 + loop.skipped)
 
 
 if __name__ == "__main__":

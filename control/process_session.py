@@ -21,6 +21,7 @@ from robotctl.safety.machine import State
 
 _START_TIMEOUT_S = 30.0
 _CLOSE_TIMEOUT_S = 6.0
+_CLOSABLE = (State.READY, State.FAULT, State.SILENT)
 
 
 class ProcessSession(Session):
@@ -111,17 +112,19 @@ class ProcessSession(Session):
                 self._error = event
 
     def _bring_down(self, process: subprocess.Popen[bytes]) -> None:
-        record = self.link.ticks.latest()
-        if record is not None and State(int(record["state"])) not in (State.READY, State.FAULT, State.SILENT):
-            process.send_signal(signal.SIGTERM)
         deadline = time.monotonic() + _CLOSE_TIMEOUT_S
-        asked = False
+        asked = stopped = False
         while process.poll() is None and time.monotonic() < deadline:
             record = self.link.ticks.latest()
-            settled = record is not None and State(int(record["state"])) in (State.READY, State.FAULT, State.SILENT)
-            if settled and not asked:
-                self.link.desk.ask(Verb.CLOSE)
-                asked = True
+            # While a request is being served, the record tells of the state before it.
+            if record is not None and self.link.desk.pending() is None:
+                settled = State(int(record["state"])) in _CLOSABLE
+                if settled and not asked:
+                    self.link.desk.ask(Verb.CLOSE)
+                elif not settled and not stopped:
+                    process.send_signal(signal.SIGTERM)
+                    stopped = True
+                asked = settled
             time.sleep(0.01)
         if process.poll() is None:
             process.kill()  # its drives have watchdogs

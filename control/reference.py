@@ -66,5 +66,6 @@ class Reference:
 
     def _integrate(self, measured: Vector) -> None:
         error = self.position - measured
-        bias = self._bias + self._ki * error * (np.abs(error) > _DEADBAND)
+        # Written so that a measurement that is no number adds nothing: every later command would be none either.
+        bias = self._bias + self._ki * np.where(np.abs(error) > _DEADBAND, error, 0.0)
         self._bias = np.minimum(np.maximum(bias, -self._bias_cap), self._bias_cap)

@@ -6,10 +6,14 @@ gone, or whose pid was given to another process since, is removed when met.
 
 import json
 import os
+import socket
 import tempfile
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
+
+from robotctl.hal.errors import BusError
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +53,27 @@ def register(robot: str, backend: str, channel: str, operator: int) -> Path:
     path = folder() / f"{pid}.json"
     path.write_text(json.dumps(asdict(entry)))
     return path
+
+
+def claim(channel: str) -> socket.socket:
+    """Take a channel for this process alone, until what is returned is closed or the process has ended.
+
+    The name is an abstract socket's: it is the machine's, not a user's, and vanishes with its process.
+
+    Raises:
+        BusError: if another process has it: two that command the same drives would fight over them.
+    """
+    interface, _, where = channel.partition(":")
+    name = f"{interface}:{os.path.realpath(where) if where.startswith('/') else where}"
+    mine = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        mine.bind(f"\0robotctl-{sha256(name.encode()).hexdigest()}")
+    except OSError:
+        mine.close()
+        raise BusError(
+            f"{channel} is in use by another robotctl", "end that one first"
+        ) from None
+    return mine
 
 
 def unregister(pid: int) -> None:

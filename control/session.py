@@ -178,9 +178,16 @@ class Session(ABC):
         self.request(Verb.START)
 
     def end(self) -> None:
-        """Take the arm back from the policy: brake, hold, ready for the next routine."""
+        """Take the arm back from the policy: brake, hold, ready for the next routine.
+
+        Raises:
+            Stopped: if a protection had stopped it meanwhile; acknowledging that is up to a person.
+        """
+        known = len(self.trips)
         self.request(Verb.STOP)
         self.wait_for(State.HOLD, timeout_s=10.0)
+        if len(self.trips) > known:
+            raise Stopped(self.trips[-1]["text"])
         self.request(Verb.ACK)
 
     def finish(self) -> None:
@@ -198,22 +205,28 @@ class Session(ABC):
 
         An arm with brakes is not parked: it stays where it is.
         """
+        self._await_pending()
         if self.state in (State.RUN, State.RESET, State.ARMED) and not self.robot.profile.brakes:
-            self.end()
-            self.finish()
-        else:
-            self.bring_to_rest(Verb.DISARM)
+            with suppress(Stopped):  # by something that happened meanwhile
+                self.end()
+                self.finish()
+        self.bring_to_rest(Verb.DISARM)
 
     def emergency_stop(self) -> None:
         """Ask for an emergency stop, without waiting. May be called from any thread."""
-        self.link.desk.ask(Verb.ESTOP)
+        self.link.desk.stop()
 
     def bring_to_rest(self, verb: Verb) -> None:
         """Stop with DISARM or ESTOP and wait until the drives are off, whatever the present state."""
+        self._await_pending()
         if self.state not in _OFF:
             with suppress(Stopped):  # it may be stopping harder already
                 self.request(verb)
             self._wait(lambda: self.state in _OFF, 10.0, "the drives did not go off")
+
+    def _await_pending(self) -> None:
+        """Wait for the answer to a request whose waiting was interrupted: it may have armed the arm."""
+        self._wait(lambda: self.link.desk.pending() is None, _ANSWER_TIMEOUT_S, "the loop did not answer")
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, complaint: str) -> None:
         deadline = self.clock.now_ns() + round(timeout_s * 1e9)

@@ -4,9 +4,11 @@ The memory is anonymous (memfd) and handed down as a file descriptor, so it has 
 user, however that one dies. The policy gets two descriptors: its mailbox, and a read-only view of the rest.
 
 Latest values are guarded by a version that is odd while a write is in progress; rings by a head that moves after
-the slot is complete. Single writer each; x86 and ARM64 both keep aligned 8-byte stores whole.
+the slot is complete. Single writer each; x86 and ARM64 both keep aligned 8-byte stores whole. Words that others wait
+for are stored through a memoryview: `struct.pack_into` clears its target first, and a reader would see the zero.
 """
 
+import fcntl
 import json
 import mmap
 import os
@@ -24,11 +26,17 @@ MAX_VALUES = 16
 """Most values a target may carry through a mailbox."""
 
 Buffer = mmap.mmap | bytearray
-_HEAD = struct.Struct("<Q")
 _TARGET = struct.Struct(f"<Qqqqii{MAX_VALUES}d")
 """version, epoch, seq, deadline, kind, count, values"""
+_BODY = struct.Struct(_TARGET.format.replace("Q", "", 1))
+_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
 _KINDS: dict[int, type[Target]] = {1: JointVelocity, 2: JointTorque, 3: Hold, 4: FreeDrive}
 _NUMBERS = {kind: number for number, kind in _KINDS.items()}
+
+
+def _words(buffer: Buffer, offset: int, count: int = 1) -> "memoryview[int]":
+    """Return aligned 64-bit words of a buffer, each of which is stored and loaded as a whole."""
+    return memoryview(buffer)[offset : offset + 8 * count].cast("q")
 
 
 class Mailbox:
@@ -38,6 +46,7 @@ class Mailbox:
 
     def __init__(self, buffer: Buffer) -> None:
         self._buffer = buffer
+        self._shared_version = _words(buffer, 0)
         self._version = 0
         self._seen = 0
 
@@ -53,18 +62,18 @@ class Mailbox:
             raise ValueError(f"a target has at most {MAX_VALUES} values, got {len(flat)}")
         padded = flat + [0.0] * (MAX_VALUES - len(flat))
         self._version += 2
-        _HEAD.pack_into(self._buffer, 0, self._version - 1)
+        self._shared_version[0] = self._version - 1
         body = (target.epoch, target.seq, target.deadline_ns, _NUMBERS[type(target)], len(flat), *padded)
-        _TARGET.pack_into(self._buffer, 0, self._version - 1, *body)
-        _HEAD.pack_into(self._buffer, 0, self._version)
+        _BODY.pack_into(self._buffer, 8, *body)
+        self._shared_version[0] = self._version
 
     def take(self) -> Target | None:
         """Return the target if it is new and whole, else None."""
-        version = _HEAD.unpack_from(self._buffer, 0)[0]
+        version = self._shared_version[0]
         if version == self._seen or version & 1:
             return None
         _, epoch, seq, deadline, number, count, *values = _TARGET.unpack_from(self._buffer, 0)
-        if _HEAD.unpack_from(self._buffer, 0)[0] != version:
+        if self._shared_version[0] != version:
             return None
         self._seen = version
         kind = _KINDS.get(number)
@@ -77,36 +86,45 @@ class Mailbox:
 
 
 class Desk:
-    """Requests of the operator to the control process, one at a time, each with its answer.
+    """Requests of the operator to the control process, one at a time, each with its answer; and the emergency stop.
 
-    `ask` is used by the operator's side, `pending` and `answer` by the control process.
+    `ask` and `stop` are used by the operator's side, `pending`, `answer` and `take_stop` by the control process. The
+    emergency stop has a word of its own: pressed in another thread, it must neither lose nor replace a request.
     """
 
-    _FORM = struct.Struct("<QQi")
-    """asked, answered, verb; the answer's text goes through the event ring"""
-    SIZE = _FORM.size
+    SIZE = 32
+    """Words: asked, answered, verb, stops. The answer's text goes through the event ring."""
 
     def __init__(self, buffer: Buffer, offset: int = 0) -> None:
-        self._buffer = buffer
-        self._offset = offset
+        self._words = _words(buffer, offset, self.SIZE // 8)
+        self._stops = 0
 
     def ask(self, verb: int) -> int:
-        """Post a request and return its number."""
-        number = int(_HEAD.unpack_from(self._buffer, self._offset)[0]) + 1
-        struct.pack_into("<i", self._buffer, self._offset + 16, verb)
-        _HEAD.pack_into(self._buffer, self._offset, number)
+        """Post a request and return its number. For one thread only."""
+        number = self._words[0] + 1
+        self._words[2] = verb
+        self._words[0] = number
         return number
 
     def answered(self, number: int) -> bool:
-        return int(self._FORM.unpack_from(self._buffer, self._offset)[1]) >= number
+        return self._words[1] >= number
 
     def pending(self) -> tuple[int, int] | None:
         """Return (number, verb) of a request that waits, else None."""
-        asked, answered, verb = self._FORM.unpack_from(self._buffer, self._offset)
-        return (asked, verb) if asked != answered else None
+        asked = self._words[0]
+        return (asked, self._words[2]) if asked != self._words[1] else None
 
     def answer(self, number: int) -> None:
-        _HEAD.pack_into(self._buffer, self._offset + 8, number)
+        self._words[1] = number
+
+    def stop(self) -> None:
+        """Post an emergency stop. May be called from any thread, at any time."""
+        self._words[3] += 1
+
+    def take_stop(self) -> bool:
+        """Return whether an emergency stop was posted since the last call."""
+        before, self._stops = self._stops, self._words[3]
+        return self._stops != before
 
 
 TICK_HEAD = struct.Struct("<qqqqqqqq")
@@ -148,6 +166,7 @@ class TickRing:
     def __init__(self, buffer: Buffer, offset: int, dof: int, slots: int) -> None:
         self._buffer = buffer
         self._offset = offset
+        self._head = _words(buffer, offset)
         self.slots = slots
         self.dtype = tick_dtype(dof)
         self.records: NDArray[Any] = np.frombuffer(buffer, self.dtype, slots, offset + 64)
@@ -162,7 +181,7 @@ class TickRing:
     @property
     def head(self) -> int:
         """Number of records written so far."""
-        return int(_HEAD.unpack_from(self._buffer, self._offset)[0])
+        return self._head[0]
 
     def fill(self, number: int, head: tuple[int, ...], vectors: tuple[Vector, ...]) -> None:
         """Write the fields of record `number`, in the order of `tick_dtype`, all but the last; not yet visible."""
@@ -174,7 +193,7 @@ class TickRing:
         """Complete record `number` with how long its tick took, and make it visible."""
         end = self._offset + 64 + (number % self.slots + 1) * self.dtype.itemsize
         struct.pack_into("<q", self._buffer, end - 8, duration_ns)
-        _HEAD.pack_into(self._buffer, self._offset, number + 1)
+        self._head[0] = number + 1
 
     def latest(self) -> np.void | None:
         """Return a copy of the newest record, or None before the first."""
@@ -207,6 +226,7 @@ class EventRing:
     def __init__(self, buffer: Buffer, offset: int) -> None:
         self._buffer = buffer
         self._offset = offset
+        self._head = _words(buffer, offset)
 
     def write(self, event: dict[str, object]) -> None:
         """Append one event; of one that is too long for a slot, its `text` is cut, or all but the type is lost."""
@@ -218,15 +238,15 @@ class EventRing:
         if len(data) > room:
             short = {"type": event["type"], "stamp_ns": event.get("stamp_ns", 0), "text": "(too long to be kept)"}
             data = json.dumps(short).encode()
-        head = _HEAD.unpack_from(self._buffer, self._offset)[0]
+        head = self._head[0]
         at = self._offset + 8 + head % self.SLOTS * self.SLOT
         struct.pack_into("<I", self._buffer, at, len(data))
         self._buffer[at + 4 : at + 4 + len(data)] = data
-        _HEAD.pack_into(self._buffer, self._offset, head + 1)
+        self._head[0] = head + 1
 
     def since(self, cursor: int) -> tuple[list[dict[str, Any]], int]:
         """Return the events from number `cursor` on, and the new cursor."""
-        head = int(_HEAD.unpack_from(self._buffer, self._offset)[0])
+        head = self._head[0]
         events = []
         for number in range(max(cursor, head - self.SLOTS + 1), head):
             at = self._offset + 8 + number % self.SLOTS * self.SLOT
@@ -250,8 +270,10 @@ class Link:
         """Create fresh shared memory for an arm with `dof` joints, remembering `slots` ticks."""
         fds = []
         for name, size in (("mailbox", Mailbox.SIZE), ("board", cls._board_size(dof, slots))):
-            fd = os.memfd_create(f"robotctl-{name}")
+            fd = os.memfd_create(f"robotctl-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
             os.ftruncate(fd, size)
+            # Who holds the mailbox could otherwise shrink it, and the control process would die of its next look.
+            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
             fds.append(fd)
         return cls.attach(fds[0], fds[1], dof, slots)
 

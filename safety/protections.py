@@ -66,11 +66,14 @@ class FeedbackAge:
         self._fault_ns = round(robot.profile.safety.feedback_fault_s * 1e9)
         self.stale = False
         """Whether the reference is to be braked to rest."""
+        self.lost = False
+        """Whether nothing is known of the arm any more."""
 
     def check(self, sample: Sample, now_ns: int) -> Trip | None:
         age = now_ns - int(sample.joint_stamp_ns.min())
         self.stale = age > self._stop_ns
-        if age <= self._fault_ns:
+        self.lost = age > self._fault_ns
+        if not self.lost:
             return None
         joint = int(sample.joint_stamp_ns.argmin())
         heard = int(sample.joint_stamp_ns[joint])

@@ -82,12 +82,17 @@ class Supervisor:
         return self.state
 
     def trip(self, trip: Trip) -> bool:
-        """Stop the arm for `trip`; a trip that is softer than the stop in force changes nothing.
+        """Stop the arm for `trip`; one that is no harder than the trip in force changes nothing.
 
-        Returns whether it took effect.
+        One as hard as a stop that the operator asked for gives that a cause, so that it latches. Returns whether the
+        trip took effect.
         """
         event = _TRIP_EVENTS[trip.category]
-        harder = self.category is None or trip.category < self.category
+        harder = (
+            self.category is None
+            or trip.category < self.category
+            or (trip.category == self.category and self.cause is None)
+        )
         if self.state in ENABLED and harder and not (event is Event.TRIP_HOLD and self.state not in _SOFT_TRIPPABLE):
             self._was_running = self.state is State.RUN
             self.state = after(self.state, event)
@@ -95,6 +100,8 @@ class Supervisor:
             self._settled = 0
         elif self.state is State.READY and trip.category is not Category.BRAKE_HOLD:
             self.state = after(self.state, event)
+        elif self.state is State.DISABLED and self.cause is None:
+            pass  # the drives are going off already; with a cause they end in FAULT
         else:
             return False
         self.cause = trip
@@ -111,11 +118,12 @@ class Supervisor:
             reference: where the drives are led (n,), rad.
         """
         state = self.state
+        silent = self.feedback.check(sample, now_ns)  # in every state: an arm is damped with the drives on, too
         if state not in ENABLED:
             return
         trip = (
             self._drives.check(sample, expect_enabled=True)
-            or self.feedback.check(sample, now_ns)
+            or silent
             or (None if self.recovery else self._position.check(sample))
             or self._tracking.check(sample, reference)
             # Category 2 comes last, so that it does not hide a harder stop.

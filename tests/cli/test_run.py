@@ -118,8 +118,16 @@ def test_a_channel_that_does_not_exist_is_missing_hardware(tmp_path: Path) -> No
     assert "can9" in result.output
 
 
-def test_a_bus_where_nobody_answers_names_the_motors(tmp_path: Path) -> None:
+def test_lockstep_is_refused_on_drives_in_real_time(tmp_path: Path) -> None:
     result, _ = robotctl(tmp_path, "--backend", "can", "--channel", "virtual:nobody")
+    assert result.exit_code == 2, result.output
+    assert "leave out --fast" in result.output
+
+
+@pytest.mark.realtime
+def test_a_bus_where_nobody_answers_names_the_motors(tmp_path: Path) -> None:
+    command = ["run", "--backend", "can", "--channel", "virtual:nobody", "--record", str(tmp_path / "r.mcap")]
+    result = CliRunner().invoke(app, command)
     assert result.exit_code == 4, result.output
     for word in ("panda_joint1", "0x01", "power"):
         assert word in result.output

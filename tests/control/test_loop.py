@@ -17,7 +17,7 @@ from robotctl.hal.types import Command, CommandMode, Sample, Sent, Truth
 from robotctl.safety.machine import ENABLED, State
 from robotctl.safety.shaper import Clip
 from robotctl.safety.target import FreeDrive, Hold, JointTorque, JointVelocity
-from robotctl.sim.motors.trouble import PowerCut
+from robotctl.sim.motors.trouble import Mute, PowerCut
 
 SLOTS = 5000
 
@@ -456,6 +456,30 @@ def test_velocity_after_torque_goes_on_from_the_measured_motion(bench):
     assert bench.truth.velocity[0] == pytest.approx(speed, abs=0.1)
 
 
+@pytest.mark.parametrize("jump", [0.1, 0.3, 1.0, 4.0, float("nan")])
+def test_one_broken_sample_in_torque_mode_is_not_where_the_arm_is_pulled_to(bench, jump):
+    bench.reach(State.ARMED)
+    assert bench.ask(Verb.START) == ""
+    for _ in range(50):
+        bench.put(FreeDrive)
+        bench.tick()
+    before, broken = bench.truth.position, [True]
+
+    def break_one(sample):
+        offset = np.zeros(7)
+        offset[0] = jump if broken.pop() else 0.0
+        broken.append(False)
+        return sample._replace(position=sample.position + offset)
+
+    bench.arm.alter = break_one
+    for _ in range(500):
+        bench.put(FreeDrive)
+        bench.tick()
+        assert np.abs(bench.truth.position - before).max() < 0.01
+        assert np.abs(bench.truth.velocity).max() < 0.2
+    assert bench.supervisor.state is (State.RUN if jump < 0.15 else State.FAULT)
+
+
 def test_free_drive_lets_itself_be_led_and_stays_where_it_is_left(bench):
     bench.reach(State.ARMED)
     assert bench.ask(Verb.START) == ""
@@ -601,6 +625,59 @@ def test_closing_while_an_arm_is_being_lowered_waits_until_it_is_down():
     assert bench.arm.calls[-2:] == ["disable", "close"]
 
 
+def test_an_emergency_stop_latches_while_an_arm_is_being_lowered():
+    bench = Bench(load_robot("openarm"))
+    bench.reach(State.ARMED)
+    assert bench.ask(Verb.DISARM) == ""
+    bench.until(State.DISABLED)
+    bench.tick(100)
+    bench.loop.estop("a test")
+    assert bench.tick() is State.FAULT
+    lowered = bench.tick(1000)
+    assert lowered is State.FAULT
+    assert bench.arm.calls[-1] == "disable"
+    assert [trip.protection.label for trip in bench.supervisor.trips] == ["P23"]
+
+
+def test_an_arm_is_not_damped_by_where_it_was_once():
+    """The gravity of a pose that is no longer measured would push the arm about for as long as nobody comes."""
+    session = LockstepSession(load_robot("openarm"), "can")
+    session.open()
+    session.request(Verb.ARM)
+    session.loop.estop("a test")
+    with pytest.raises(Stopped):
+        session.wait_for(State.HOLD, timeout_s=3.0)
+    bench = session._rig.arm._channel.bus.bench
+    session.advance(0.5)
+    assert all(drive.enabled for drive in bench.drives)
+    bench.trouble.add(Mute(motor_id=2))
+    session.advance(0.5)
+    assert not any(drive.enabled for drive in bench.drives)
+
+
+def test_a_reset_routine_brakes_while_a_joint_is_not_heard_of():
+    session = LockstepSession(load_robot("panda"), "can")
+    session.open()
+    session.request(Verb.ARM)
+    session.request(Verb.START)
+    for seq in range(10):
+        epoch, deadline = int(session.latest()["epoch"]), session.clock.now_ns() + 10**8
+        session.link.mailbox.put(JointVelocity(np.full(7, 0.3), epoch, seq, deadline))
+        session.advance(0.05)
+    session.end()
+    session.request(Verb.HOME)
+    session.advance(0.1)
+    fastest = np.abs(session.latest()["command_velocity"]).max()
+    mute = Mute(motor_id=1)
+    session._rig.arm._channel.bus.bench.trouble.add(mute)
+    session.advance(0.045)
+    assert session.state is State.RESET
+    assert np.abs(session.latest()["command_velocity"]).max() < 0.6 * fastest
+    session._rig.arm._channel.bus.bench.trouble.remove(mute)
+    session.wait_for(State.ARMED, timeout_s=30.0)
+    assert session.trips == []
+
+
 # -- what is published ---------------------------------------------------------------------------------------------
 
 
@@ -644,3 +721,29 @@ def test_a_drive_that_loses_its_power_ends_in_a_fault_on_can():
     assert not any(drive.enabled for drive in session._rig.arm._channel.bus.bench.drives)
     with pytest.raises(DriveError, match="did not confirm"):
         session.close()
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_late_tick_does_not_leave_the_reference_behind(told: bool) -> None:
+    """The drives go on at the speed they were given; a reference that stands still meanwhile would pull them back."""
+    robot = load_robot("panda")
+    with LockstepSession(robot, "sim") as session:
+        session.prepare()
+        session.begin()
+        worst = 0.0
+        for step in range(60):
+            record = session.latest()
+            wanted = np.array([0.8 if step < 40 else 0.0, *np.zeros(6)])
+            deadline = session.clock.now_ns() + 100_000_000
+            session.link.mailbox.put(JointVelocity(wanted, int(record["epoch"]), step, deadline))
+            session.advance(0.02)
+            if step % 10 == 5:  # three ticks do not take place
+                session.clock.sleep_until(session.clock.now_ns() + 4 * robot.period_ns)
+                session._next_ns = session.clock.now_ns()
+                session.loop.skipped = 3 if told else 0
+                session.loop.tick()
+                session.loop.skipped = 0
+                session._next_ns += robot.period_ns
+            record = session.latest()
+            worst = max(worst, np.abs(record["command_position"] - record["true_position"]).max())
+        assert bool(worst < 1.5e-3) is told, worst

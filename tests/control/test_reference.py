@@ -106,3 +106,10 @@ def test_efforts_never_exceed_the_joints_torque(robot: Robot, reference: Referen
         velocity = rng.uniform(-1, 1, robot.dof) * robot.limits.velocity
         effort = reference.step(velocity, reference.position).effort
         assert (np.abs(effort) <= robot.limits.torque).all()
+
+
+def test_a_measurement_that_is_no_number_leaves_no_trace(robot: Robot, reference: Reference):
+    home, rest = np.array(robot.profile.home), np.zeros(robot.dof)
+    expected = reference.step(rest, home).effort
+    reference.step(rest, np.full(robot.dof, np.nan))
+    assert reference.step(rest, home).effort == pytest.approx(expected)

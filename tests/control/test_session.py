@@ -158,3 +158,41 @@ def test_a_whole_life_is_seen_by_judge_and_statistics(session):
     assert session.statistics.report()["servo_hz"] == pytest.approx(500.0)
     assert session.judge.judged > 0
     assert session.judge.on_truth
+
+
+def test_ending_an_episode_does_not_acknowledge_what_stopped_the_arm_meanwhile(session):
+    session.prepare()
+    session.begin()
+    session.advance(0.02)
+    bad = JointVelocity(np.full(7, np.nan), int(session.latest()["epoch"]), 0, session.clock.now_ns() + 10**8)
+    session.link.mailbox.put(bad)
+    session.loop.tick()  # which the operator's side has not looked at yet
+    with pytest.raises(Stopped, match="malformed target"):
+        session.end()
+    assert session.state is State.HOLD
+
+
+def test_an_emergency_stop_survives_whatever_is_asked_in_the_same_tick(session):
+    session.request(Verb.ARM)
+    session.emergency_stop()
+    with pytest.raises(Stopped, match="START is refused in state STOPPING"):
+        session.begin()
+    session.bring_to_rest(Verb.DISARM)
+    assert session.state is State.FAULT
+
+
+def test_a_request_is_answered_though_an_emergency_stop_came_in_between(session):
+    session.request(Verb.ARM)
+    session.on_poll = session.emergency_stop
+    with pytest.raises(Stopped, match="START is refused"):
+        session.begin()
+
+
+def test_winding_down_ends_at_rest_whatever_happens_meanwhile():
+    with LockstepSession(load_robot("openarm"), "sim") as session:
+        session.prepare()
+        session.begin()
+        session.advance(0.02)
+        session.loop.estop("a test")
+        session.wind_down()
+        assert session.state is State.FAULT

@@ -2,7 +2,9 @@
 
 import json
 import os
+import signal
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -157,6 +159,28 @@ def test_a_new_request_takes_the_place_of_one_that_nobody_answered():
     assert desk.pending() == (second, 10)
     desk.answer(second)
     assert desk.answered(first)
+
+
+def test_an_emergency_stop_neither_loses_nor_replaces_a_request():
+    buffer = bytearray(Desk.SIZE)
+    operator, loop = Desk(buffer), Desk(buffer)
+    assert not loop.take_stop()
+    number = operator.ask(4)
+    operator.stop()
+    operator.stop()
+    assert loop.pending() == (number, 4)
+    assert loop.take_stop()
+    assert not loop.take_stop()
+    operator.stop()
+    second = operator.ask(5)
+    assert loop.take_stop()
+    assert loop.pending() == (second, 5)
+
+
+def test_a_stop_posted_before_anybody_listens_is_found():
+    buffer = bytearray(Desk.SIZE)
+    Desk(buffer).stop()
+    assert Desk(buffer).take_stop()
 
 
 # -- the ring of ticks ---------------------------------------------------------------------------------------------
@@ -360,3 +384,54 @@ def test_the_memory_of_two_links_is_not_the_same(link):
     finally:
         for fd in other.fds:
             os.close(fd)
+
+
+def test_who_holds_the_mailbox_cannot_shrink_it_under_the_loop():
+    link = Link.create(7, 200)
+    for fd in link.fds:
+        for size in (0, 1 << 24):
+            with pytest.raises(PermissionError):
+                os.ftruncate(fd, size)
+    assert link.mailbox.take() is None
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("part", ["head", "events", "mailbox", "desk"])
+def test_no_process_sees_a_word_on_its_way(part):
+    """A store that clears first shows zeros to a neighbour: a ring that begins anew, a request that nobody made."""
+    link = Link.create(7, 200)
+    pid = os.fork()
+    if pid == 0:
+        actions = {
+            "head": lambda number: link.ticks.publish(number, 0),
+            "events": lambda _: link.events.write({"type": "log"}),
+            "mailbox": lambda number: link.mailbox.put(Hold(7, number, 7)),
+            "desk": lambda _: link.desk.answer(link.desk.ask(3)),
+        }
+        number = 0
+        while os.getppid() != 1:
+            number += 1
+            actions[part](number)
+        os._exit(0)
+    try:
+        last, changes, deadline = 0, 0, time.monotonic() + 10.0
+        while changes < 3_000 and time.monotonic() < deadline:
+            match part:
+                case "head":
+                    value = link.ticks.head
+                case "events":
+                    value = link.events._head[0]
+                case "desk":
+                    value, verb = link.desk.pending() or (last, 3)
+                    assert verb == 3
+                case _:
+                    target = link.mailbox.take()
+                    assert target is None or (target.epoch, target.deadline_ns) == (7, 7)
+                    value = last if target is None else target.seq
+            assert value >= last
+            changes += value != last
+            last = value
+        assert changes == 3_000
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)

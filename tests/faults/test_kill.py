@@ -102,3 +102,27 @@ def test_signals_to_the_operator_stop_the_arm(start: Any, robot: str, number: si
     assert report["safety"]["state"] in ("READY", "FAULT")
     assert report["safety"]["violations"] == {"position": 0, "velocity": 0, "sphere": 0}
     assert run.left_behind() == []
+
+
+def test_sigterm_during_the_start_ends_as_a_stop(start: Any) -> None:
+    run = start(*LONG)
+    while "control" not in run.pids():
+        time.sleep(0.01)
+    run.process.send_signal(signal.SIGTERM)
+    status, output, _ = run.finish()
+    assert status == 3, output
+    assert "Traceback" not in output
+    assert run.left_behind() == []
+
+
+def test_sigterm_while_an_interruption_winds_down_ends_as_a_stop(start: Any) -> None:
+    run = start("--robot", "openarm", *LONG)
+    run.wait_running()
+    run.process.send_signal(signal.SIGINT)
+    time.sleep(0.3)
+    run.process.send_signal(signal.SIGTERM)
+    status, output, report = run.finish()
+    assert status == 3, output
+    assert report["safety"]["state"] == "FAULT"
+    assert report["stopped"] == "emergency stop by SIGTERM"
+    assert run.left_behind() == []

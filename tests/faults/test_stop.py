@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import signal
 import subprocess
 import time
 from pathlib import Path
@@ -10,6 +11,10 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+from robotctl.cli.main import app
+from robotctl.control.session import Session
 
 from .conftest import ROBOTCTL
 
@@ -65,3 +70,37 @@ def test_one_key_is_the_emergency_stop(tmp_path: Path, key: bytes) -> None:
     trip = json.loads(report.read_text())["safety"]["trips"][0]
     assert (trip["protection"], trip["stop_category"]) == ("P23", 1)
     assert trip["reaction_ms"] < 20.0
+
+
+def test_the_key_works_while_an_interrupted_arm_is_parked(tmp_path: Path) -> None:
+    master, slave = pty.openpty()
+    report = tmp_path / "report.json"
+    command = [*ROBOTCTL, "run", "--robot", "openarm", "--policy", "random", "--episodes", "4"]
+    command += ["--json", str(report), "--record", str(tmp_path / "run.mcap")]
+    run = subprocess.Popen(command, stdin=slave, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    os.close(slave)
+    time.sleep(5.0)
+    run.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    os.write(master, b" ")
+    output, _ = run.communicate(timeout=30)
+    os.close(master)
+    assert run.returncode == 130, output
+    safety = json.loads(report.read_text())["safety"]
+    assert [trip["protection"] for trip in safety["trips"]] == ["P23"]
+    assert safety["state"] == "FAULT"
+
+
+def test_an_error_in_the_operators_process_stops_the_arm_at_once(tmp_path: Path, monkeypatch: Any) -> None:
+    sessions = []
+
+    def go_wrong(session: Session, *_: Any) -> None:
+        sessions.append(session)
+        session.prepare()
+        session.begin()
+        raise BrokenPipeError
+
+    monkeypatch.setattr("robotctl.cli.run.run_episodes", go_wrong)
+    result = CliRunner().invoke(app, ["run", "--record", str(tmp_path / "run.mcap")])
+    assert isinstance(result.exception, BrokenPipeError)
+    assert [trip["text"].split(";")[0] for trip in sessions[0].trips] == ["emergency stop by the operator"]

@@ -525,3 +525,25 @@ def test_a_refused_event_changes_nothing():
     with pytest.raises(Refused):
         supervisor.handle(Event.START)
     assert (supervisor.state, supervisor.epoch) == (State.READY, before)
+
+
+@pytest.mark.parametrize("at", [State.STOPPING, State.DISABLED])
+def test_an_emergency_stop_latches_while_the_operator_disarms(at):
+    supervisor = Bench(State.RUN).supervisor
+    supervisor.handle(Event.DISARM)
+    if at is State.DISABLED:
+        supervisor.handle(Event.STANDSTILL_OFF)
+    assert supervisor.trip(a_trip(Category.BRAKE_OFF, Protection.ESTOP))
+    assert supervisor.state is at
+    assert supervisor.cause.protection is Protection.ESTOP
+    assert not supervisor.trip(a_trip(Category.BRAKE_OFF, Protection.ESTOP))
+    assert len(supervisor.trips) == 1
+
+
+def test_the_age_of_feedback_is_known_with_the_drives_off_too():
+    bench = Bench(State.READY)
+    for age_ms, stale, lost in ((5, False, False), (20, True, False), (60, True, True), (0, False, False)):
+        bench.age_ns[3] = age_ms * MS
+        bench.observe()
+        assert (bench.supervisor.feedback.stale, bench.supervisor.feedback.lost) == (stale, lost)
+    assert bench.supervisor.trips == []

@@ -20,7 +20,7 @@ from robotctl.hal.can.damiao.power import clear_faults, not_ready, switch_off
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.damiao.verification import Eavesdropper, Expected, verify_drive
 from robotctl.hal.can.transport import Transport, route_key
-from robotctl.hal.clock import Clock
+from robotctl.hal.clock import Clock, VirtualClock
 from robotctl.hal.errors import ConfigError, DriveError, HardwareError
 from robotctl.hal.profile import CanBus
 from robotctl.hal.profile import Drive as DriveProfile
@@ -96,6 +96,12 @@ class DamiaoArm(Arm):
         if self._open:
             return
         channel = open_channel(self._name, self._robot, self._clock)
+        if isinstance(self._clock, VirtualClock) and not channel.simulated:
+            channel.bus.shutdown()
+            raise ConfigError(
+                f"the drives behind {self._name!r} live in real time, which lockstep outruns: they would move too fast",
+                "leave out --fast, or use --channel emulated",
+            )
         transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
         self._channel, self._transport = channel, transport
         self._verified = self._enabled = False

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from robotctl.hal.can.channel import Channel
 from robotctl.hal.can.damiao.codec import BROADCAST_ID, MitCommand, Special, encode_mit, is_feedback
 from robotctl.hal.can.damiao.drive import DrivesError
 from robotctl.hal.errors import BusError, ConfigError, DriveError, HardwareError
@@ -389,3 +390,14 @@ def test_all_problems_are_one_error(bench):
     with pytest.raises(DrivesError) as caught:
         bench.arm.verify()
     assert [problem.motor_id for problem in caught.value.problems] == [1, 4, 6]
+
+
+def test_lockstep_is_refused_where_the_drives_live_in_real_time(bench, monkeypatch):
+    channel = Channel(bench.bus, fd=True, simulated=False)
+    monkeypatch.setattr("robotctl.hal.can.damiao.arm.open_channel", lambda name, robot, clock: channel)
+    with pytest.raises(ConfigError, match="would move too fast") as caught:
+        bench.arm.connect()
+    assert "--fast" in str(caught.value)
+    assert bench.bus.sent == []
+    with pytest.raises(HardwareError, match="not connected"):
+        bench.arm.verify()

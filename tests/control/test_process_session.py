@@ -1,0 +1,90 @@
+"""A session in a process of its own, around a control process that is busy when it is asked to end."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from robotctl.control import registry
+from robotctl.control.loop import Verb
+from robotctl.control.process_session import ProcessSession
+from robotctl.hal.errors import HardwareError
+from robotctl.hal.robot import Robot
+from robotctl.safety.machine import State
+
+pytestmark = pytest.mark.realtime
+
+SLOW_S = 1.0
+"""How long the drives of the backend `slow` take to come on."""
+
+BACKEND = f"""
+import time
+
+from robotctl.sim.backend import open_sim
+
+
+def open_slow(robot, clock, channel=""):
+    rig = open_sim(robot, clock)
+    enable = rig.arm.enable
+
+    def slow():
+        time.sleep({SLOW_S})
+        enable()
+
+    rig.arm.enable = slow
+    return rig
+"""
+
+
+@pytest.fixture
+def session(panda: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ProcessSession]:
+    (tmp_path / "slow.py").write_text(BACKEND)
+    about = tmp_path / "slow-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: slow\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[robotctl.backends]\nslow = slow:open_slow\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    session = ProcessSession(panda, "slow")
+    session.open()
+    session.link.desk.ask(Verb.ARM)  # and whoever asked was interrupted
+    time.sleep(0.3 * SLOW_S)
+    assert session.state is State.READY  # for all that can be seen
+    yield session
+    session.close()
+
+
+def test_closing_while_the_drives_come_on_switches_them_off(session: ProcessSession) -> None:
+    began = time.monotonic()
+    session.close()
+    assert session._process is not None
+    assert session._process.returncode == 0
+    assert time.monotonic() - began < 4.0
+    assert [trip["protection"] for trip in session.trips] == ["P23"]
+
+
+@pytest.mark.parametrize("how", ["wind_down", "bring_to_rest"])
+def test_at_rest_means_that_nothing_comes_on_any_more(session: ProcessSession, how: str) -> None:
+    if how == "wind_down":
+        session.wind_down()
+    else:
+        session.bring_to_rest(Verb.DISARM)
+    assert session.state is State.READY
+    states = [event["text"] for event in session.link.events.since(0)[0] if event["type"] == "state"]
+    assert states[-1].endswith("-> READY")
+    assert len(states) > 3
+    time.sleep(SLOW_S)
+    assert session.state is State.READY
+
+
+def test_a_channel_belongs_to_one_process_at_a_time(panda: Robot, tmp_path: Path) -> None:
+    port, alias = tmp_path / "ttyACM0", tmp_path / "arm"
+    port.touch()
+    alias.symlink_to(port)
+    with registry.claim(f"slcan:{port}"):
+        session = ProcessSession(panda, "can", f"slcan:{alias}", ["servo_hz=250"])
+        with pytest.raises(HardwareError, match="in use by another robotctl"), session:
+            pass
+        registry.claim("slcan:/dev/ttyACM1").close()
+    registry.claim(f"slcan:{port}").close()
