@@ -70,9 +70,7 @@ def claim(channel: str) -> socket.socket:
         mine.bind(f"\0robotctl-{sha256(name.encode()).hexdigest()}")
     except OSError:
         mine.close()
-        raise BusError(
-            f"{channel} is in use by another robotctl", "end that one first"
-        ) from None
+        raise BusError(f"{channel} is in use by another robotctl", "end that one first") from None
     return mine
 
 
