@@ -27,6 +27,8 @@ from robotctl.safety.trip import Category, Protection, Trip
 
 _LARGEST_GAP = 10
 """Skipped periods that the reference follows; a longer gap shows as a tracking error."""
+_OPERATOR_SILENCE_NS = 1_000_000_000
+"""Time without a beat from the operator's process after which what moves is stopped."""
 _LOWERING_S = 2.0
 """Time over which gravity compensation fades before the drives of an arm without brakes go off."""
 
@@ -77,6 +79,8 @@ class Loop:
         self._lowering_ns: int | None = None
         self._closing = False
         self._answer: tuple[int, str] | None = None
+        self._beats = 0
+        self._beat_ns = 0
 
     # -- life -----------------------------------------------------------------------------------------------------
 
@@ -120,6 +124,7 @@ class Loop:
         supervisor = self.supervisor
         if self._link.desk.take_stop():
             self._serve_estop("the operator", now)
+        self._watch_operator(now)
         if self._estop:
             source, self._estop = self._estop, ""
             self._serve_estop(source, now)
@@ -303,6 +308,16 @@ class Loop:
         else:
             self.supervisor.handle(Event.CLOSE)
             self.shut_down()
+
+    def _watch_operator(self, now: int) -> None:
+        """Stop what moves when the operator's process, once it has shown life, is suspended or blocked."""
+        beats = self._link.desk.beats
+        if beats != self._beats:
+            self._beats, self._beat_ns = beats, now
+        elif beats and now - self._beat_ns > _OPERATOR_SILENCE_NS and self.supervisor.state in (State.RUN, State.RESET):
+            cause = f"the operator's process has been silent for {_OPERATOR_SILENCE_NS / 1e9:g} s"
+            onset = self._beat_ns + _OPERATOR_SILENCE_NS
+            self.supervisor.trip(Trip(Protection.OPERATOR, Category.BRAKE_HOLD, cause, onset))
 
     def _serve_estop(self, source: str, now: int) -> None:
         cause = f"emergency stop by {source}; release it, then acknowledge"

@@ -20,6 +20,8 @@ from robotctl.hal.robot import Robot
 from robotctl.safety.machine import State
 
 _START_TIMEOUT_S = 30.0
+_BEAT_S = 0.05
+"""How often the control process is shown that this one is alive."""
 _CLOSE_TIMEOUT_S = 6.0
 _CLOSABLE = (State.READY, State.FAULT, State.SILENT)
 
@@ -78,8 +80,14 @@ class ProcessSession(Session):
         self.poll()
 
     def advance(self, seconds: float) -> None:
-        time.sleep(seconds)
-        self._check()
+        deadline = time.monotonic() + seconds
+        while True:
+            self.link.desk.beat()
+            self._check()
+            remaining = deadline - time.monotonic()
+            if remaining <= 0.0:
+                break
+            time.sleep(min(_BEAT_S, remaining))
         self.poll()
 
     def close(self) -> None:

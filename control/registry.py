@@ -7,7 +7,6 @@ gone, or whose pid was given to another process since, is removed when met.
 import json
 import os
 import socket
-import tempfile
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from hashlib import sha256
@@ -31,9 +30,14 @@ class Running:
 
 
 def folder() -> Path:
-    """Return the folder of the registry, which may not exist yet."""
-    base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
-    return Path(base) / f"robotctl-{os.getuid()}"
+    """Return the folder of the registry, which may not exist yet.
+
+    It depends on the user alone, so that `robotctl stop` finds an arm from any shell; `ROBOTCTL_RUNTIME_DIR` moves it.
+    """
+    user = os.getuid()
+    runtime = Path(f"/run/user/{user}")
+    base = os.environ.get("ROBOTCTL_RUNTIME_DIR") or (runtime if runtime.is_dir() else "/tmp")  # noqa: S108
+    return Path(base) / f"robotctl-{user}"
 
 
 def start_time(pid: int) -> int | None:

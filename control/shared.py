@@ -92,8 +92,8 @@ class Desk:
     emergency stop has a word of its own: pressed in another thread, it must neither lose nor replace a request.
     """
 
-    SIZE = 32
-    """Words: asked, answered, verb, stops. The answer's text goes through the event ring."""
+    SIZE = 40
+    """Words: asked, answered, verb, stops, beats. The answer's text goes through the event ring."""
 
     def __init__(self, buffer: Buffer, offset: int = 0) -> None:
         self._words = _words(buffer, offset, self.SIZE // 8)
@@ -120,6 +120,15 @@ class Desk:
     def stop(self) -> None:
         """Post an emergency stop. May be called from any thread, at any time."""
         self._words[3] += 1
+
+    def beat(self) -> None:
+        """Show that the operator's process is alive. For one thread only."""
+        self._words[4] += 1
+
+    @property
+    def beats(self) -> int:
+        """Number of beats so far; 0 where the operator's process shows no life, as in lockstep."""
+        return self._words[4]
 
     def take_stop(self) -> bool:
         """Return whether an emergency stop was posted since the last call."""

@@ -25,6 +25,7 @@ class Protection(IntEnum):
     HEARTBEAT = 10
     FEEDBACK = 12
     TRACKING = 17
+    OPERATOR = 22
     ESTOP = 23
     DRIVE = 24
     RESET = 29

@@ -45,7 +45,7 @@ def session(panda: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: slow\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text("[robotctl.backends]\nslow = slow:open_slow\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("ROBOTCTL_RUNTIME_DIR", str(tmp_path))
     session = ProcessSession(panda, "slow")
     session.open()
     session.link.desk.ask(Verb.ARM)  # and whoever asked was interrupted

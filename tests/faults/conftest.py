@@ -25,7 +25,7 @@ class Run:
     def __init__(self, folder: Path, *arguments: str) -> None:
         self.folder = folder
         self.report_path = folder / "report.json"
-        self.environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
+        self.environment = os.environ | {"ROBOTCTL_RUNTIME_DIR": str(folder)}
         files = ["--json", str(self.report_path), "--record", str(folder / "run.mcap")]
         self.process = subprocess.Popen(
             [*ROBOTCTL, "run", *arguments, *files],

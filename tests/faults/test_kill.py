@@ -126,3 +126,16 @@ def test_sigterm_while_an_interruption_winds_down_ends_as_a_stop(start: Any) -> 
     assert report["safety"]["state"] == "FAULT"
     assert report["stopped"] == "emergency stop by SIGTERM"
     assert run.left_behind() == []
+
+
+def test_a_suspended_operator_does_not_leave_the_arm_moving(start: Any) -> None:
+    run = start(*LONG)
+    run.wait_running()
+    os.kill(run.process.pid, signal.SIGSTOP)
+    time.sleep(3.0)
+    os.kill(run.process.pid, signal.SIGCONT)
+    status, output, report = run.finish()
+    assert status == 3, output
+    trip = report["safety"]["trips"][0]
+    assert (trip["protection"], trip["stop_category"]) == ("P22", 2)
+    assert trip["reaction_ms"] < 50.0
