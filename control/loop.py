@@ -25,7 +25,7 @@ from robotctl.safety.supervisor import Supervisor
 from robotctl.safety.target import FreeDrive, JointTorque, JointVelocity
 from robotctl.safety.trip import Category, Protection, Trip
 
-_LARGEST_GAP = 10
+_LARGEST_GAP = 25
 """Skipped periods that the reference follows; a longer gap shows as a tracking error."""
 _OPERATOR_SILENCE_NS = 1_000_000_000
 """Time without a beat from the operator's process after which what moves is stopped."""

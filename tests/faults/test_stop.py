@@ -69,7 +69,7 @@ def test_one_key_is_the_emergency_stop(tmp_path: Path, key: bytes) -> None:
     assert run.returncode == 3, output
     trip = json.loads(report.read_text())["safety"]["trips"][0]
     assert (trip["protection"], trip["stop_category"]) == ("P23", 1)
-    assert trip["reaction_ms"] < 20.0
+    assert trip["reaction_ms"] < 100.0
 
 
 def test_the_key_works_while_an_interrupted_arm_is_parked(tmp_path: Path) -> None:
