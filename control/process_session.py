@@ -37,7 +37,6 @@ class ProcessSession(Session):
         self._process: subprocess.Popen[bytes] | None = None
         self._bus: dict[str, object] | None = None
         self._error: dict[str, Any] | None = None
-        self._own_cursor = 0
         self._complaints = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
 
     @property
@@ -97,7 +96,6 @@ class ProcessSession(Session):
         if process is not None:
             registry.unregister(process.pid)
             self.poll()
-            self._collect()
         self._complaints.close()
         if self.link.fds is not None:
             for fd in self.link.fds:
@@ -107,17 +105,12 @@ class ProcessSession(Session):
     def bus_statistics(self) -> dict[str, object] | None:
         return self._bus
 
-    def poll(self) -> None:
-        super().poll()
-        self._collect()
-
-    def _collect(self) -> None:
-        events, self._own_cursor = self.link.events.since(self._own_cursor)
-        for event in events:
-            if event["type"] == "bus":
-                self._bus = event["statistics"]
-            elif event["type"] == "error":
-                self._error = event
+    def _take_event(self, event: dict[str, Any]) -> None:
+        super()._take_event(event)
+        if event["type"] == "bus":
+            self._bus = event["statistics"]
+        elif event["type"] == "error":
+            self._error = event
 
     def _bring_down(self, process: subprocess.Popen[bytes]) -> None:
         deadline = time.monotonic() + _CLOSE_TIMEOUT_S

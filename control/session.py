@@ -118,14 +118,17 @@ class Session(ABC):
         self.statistics.take(records, dropped)
         events, self._event_cursor = self.link.events.since(self._event_cursor)
         for event in events:
-            if event["type"] == "answer":
-                self._answers[event["number"]] = event
-            elif event["type"] == "trip":
-                self.trips.append(event)
-                if self.on_trip is not None:
-                    self.on_trip(event)
+            self._take_event(event)
             if self.on_event is not None:
                 self.on_event(event)
+
+    def _take_event(self, event: dict[str, Any]) -> None:
+        if event["type"] == "answer":
+            self._answers[event["number"]] = event
+        elif event["type"] == "trip":
+            self.trips.append(event)
+            if self.on_trip is not None:
+                self.on_trip(event)
 
     # -- asking ---------------------------------------------------------------------------------------------------
 

@@ -331,9 +331,3 @@ class Board:
     def read_only(fd: int) -> int:
         """Return a new descriptor of a board that allows reading only."""
         return os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
-
-
-def vector(record: np.void, field: str) -> Vector:
-    """Return an array field of a record."""
-    array: Vector = record[field]
-    return array
