@@ -4,10 +4,27 @@ Life of an arm: `connect` -> `verify` -> `enable` -> (`read`, `write`)* -> `hold
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from robotctl.hal.types import Command, GripperSample, Sample, Sent, Truth
+
+
+class Inspector(Protocol):
+    """Has the last word on what leaves for the drives: any text it returns says why that is kept back."""
+
+    def frames(self, frames: Sequence[tuple[int, bytes]]) -> str:
+        """Judge encoded CAN frames (id, data) that are about to leave together."""
+        ...
+
+    def command(self, command: Command) -> str:
+        """Judge a command of an arm without a wire."""
+        ...
+
+    def enabling(self) -> str:
+        """Judge that the drives of an arm without a wire are about to come on."""
+        ...
 
 
 class Arm(ABC):
@@ -17,6 +34,10 @@ class Arm(ABC):
         HardwareError: from `connect`, `verify`, `enable` and `disable`. `read` and `write` raise it only
             when the bus itself is gone; what a single drive lacks shows in the sample's stamps and faults.
     """
+
+    @abstractmethod
+    def inspect_with(self, inspector: Inspector) -> None:
+        """Let nothing leave from now on that `inspector` objects to."""
 
     @abstractmethod
     def connect(self) -> None:

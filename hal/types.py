@@ -42,6 +42,10 @@ class Sample(NamedTuple):
     faults: tuple[Fault, ...] = ()
     enabled: bool = False
     """Whether every drive reported that it is enabled."""
+    temperature: Vector | None = None
+    """Hottest part of each drive, degrees Celsius; None where the drives do not tell."""
+    rejected: int = 0
+    """Frames refused since connecting: on a drive's id, but of a wrong length or not decodable."""
 
 
 class CommandMode(IntEnum):
@@ -73,6 +77,8 @@ class Sent(NamedTuple):
     command: Command
     altered: str = ""
     """Empty when the command went out as it was (up to the drive's quantisation)."""
+    delivered: bool = True
+    """Whether it left the host, for every joint."""
 
 
 class GripperSample(NamedTuple):

@@ -1,4 +1,4 @@
-"""A trip: why the arm was stopped, as data."""
+"""A trip: why the arm was stopped, as data; and the list of protections, with what clears each."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -15,24 +15,64 @@ class Category(IntEnum):
     """Brake under control, then hold."""
 
 
-class Protection(IntEnum):
-    """The protections that can stop an arm, numbered as in docs/safety.md."""
+class Clearing(IntEnum):
+    """What it takes to go on after a latched stop."""
 
+    START = 1
+    """The operator's START is enough: it counts as acknowledgement."""
+    ACK = 2
+    """The operator acknowledges first."""
+    POWER = 3
+    """The drives' power has to be cycled before an acknowledgement is taken."""
+
+
+class Protection(IntEnum):
+    """The protections, numbered as in docs/safety.md."""
+
+    VELOCITY = 1
     POSITION = 3
     SPHERE = 5
+    ACCELERATION = 6
+    TORQUE = 7
     TORQUE_STATE = 8
     MALFORMED = 9
     HEARTBEAT = 10
+    OVERRUN = 11
     FEEDBACK = 12
+    BUS = 14
+    RECEIVE = 15
+    FRAMES = 16
     TRACKING = 17
+    OVERSPEED = 18
+    CONTACT = 19
+    PROXIMITY = 20
+    BUMP = 21
     OPERATOR = 22
     ESTOP = 23
     DRIVE = 24
+    WEIGHTS = 26
+    WATCHMAN = 27
     RESET = 29
 
     @property
     def label(self) -> str:
         return f"P{self.value}"
+
+    @property
+    def clearing(self) -> Clearing:
+        return _CLEARING.get(self, Clearing.ACK)
+
+
+_CLEARING = {
+    Protection.MALFORMED: Clearing.START,
+    Protection.HEARTBEAT: Clearing.START,
+    # A guard that tripped has met a bug, and a drive that failed keeps what it knows to itself.
+    Protection.VELOCITY: Clearing.POWER,
+    Protection.ACCELERATION: Clearing.POWER,
+    Protection.TORQUE: Clearing.POWER,
+    Protection.FRAMES: Clearing.POWER,
+    Protection.DRIVE: Clearing.POWER,
+}
 
 
 class Trip(NamedTuple):

@@ -5,7 +5,7 @@ from collections import deque
 
 import numpy as np
 
-from robotctl.hal.arm import Arm, Gripper
+from robotctl.hal.arm import Arm, Gripper, Inspector
 from robotctl.hal.backend import Rig
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError, HardwareError
@@ -44,11 +44,15 @@ class SimArm(Arm):
         self._waiting: deque[tuple[int, Command]] = deque()
         self._connected = False
         self._enabled = False
+        self._inspector: Inspector | None = None
 
     @property
     def enabled(self) -> bool:
         """Whether its drives are on."""
         return self._enabled
+
+    def inspect_with(self, inspector: Inspector) -> None:
+        self._inspector = inspector
 
     def connect(self) -> None:
         self._connected = True
@@ -59,6 +63,9 @@ class SimArm(Arm):
     def enable(self) -> None:
         self._require_connected()
         if not self._enabled:
+            refusal = self._inspector.enabling() if self._inspector else ""
+            if refusal:
+                raise HardwareError(f"the drives were not enabled: {refusal}")
             self._plant.advance(self._clock.now_ns())
             self._enabled = True
             holding = self._holding()
@@ -83,7 +90,10 @@ class SimArm(Arm):
         if not self._enabled:
             return Sent(command, "drives are off")
         if not self._is_sound(command):
-            return Sent(command, "not sent: a value is not finite, or there are not as many as joints")
+            return Sent(command, "not sent: a value is not finite, or there are not as many as joints", delivered=False)
+        refusal = self._inspector.command(command) if self._inspector else ""
+        if refusal:
+            return Sent(command, f"not sent: {refusal}", delivered=False)
         if self._delay_ns:
             self._waiting.append((self._clock.now_ns() + self._delay_ns, command))
         else:

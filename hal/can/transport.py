@@ -16,7 +16,7 @@ import select
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import can
@@ -58,6 +58,9 @@ Route = Callable[[bytearray, int], bool]
 Listener = Callable[[int, bytes], None]
 """Takes the id and the data of a frame that no route understood."""
 
+FrameInspector = Callable[[Sequence[tuple[int, bytes]]], str]
+"""Sees the frames (id, data) that are about to leave together. Any text it returns keeps them all back."""
+
 
 class RoundTrip(NamedTuple):
     """Times from a request to its reply, in microseconds, of the latest 4096 replies."""
@@ -80,11 +83,20 @@ class Transport:
         self.fd = channel.fd
         self.simulated = channel.simulated
         self.routes: dict[int, Route] = {}
+        self.reply_ids: set[int] = set()
+        """Ids on which only drives of ours may speak."""
         self.listener: Listener | None = None
+        self.inspector: FrameInspector | None = None
+        self.refusal = ""
+        """What the inspector said of the latest frames; empty if they went out."""
         self.sent = 0
+        self.withheld = 0
+        """Frames that the inspector kept back."""
         self.received = 0
         self.error_frames = 0
         self.unexpected = 0
+        self.rejected = 0
+        """Those of the unexpected that came on an id of ours: of a wrong length, or without sense."""
         self.send_failures = 0
         self.state = "active"
         """What the error frames say of the controller: active, passive or bus-off."""
@@ -112,6 +124,8 @@ class Transport:
         """
         if self._lost:
             raise self._gone()
+        if self.inspector is not None and self._is_withheld([(arbitration_id, data)]):
+            return False
         if self.state == "bus-off" and not force:
             self.send_failures += 1
             return False
@@ -126,13 +140,15 @@ class Transport:
         self._failing_since = None
         return True
 
-    def send_all(self, frames: Iterable[tuple[int, bytes]]) -> int:
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
         """Send the frames of one cycle, FD where the channel is, and return how many left the host.
 
         After the first failure the others are not tried: with a full queue each would cost SEND_TIMEOUT_S.
         """
         if self._lost:
             raise self._gone()
+        if self.inspector is not None and self._is_withheld(frames):
+            return 0
         if self.state == "bus-off":
             self.send_failures += 1
             return 0
@@ -183,6 +199,8 @@ class Transport:
                 if route is not None and route(data, now if simulated else _stamp(now, wall, message.timestamp)):
                     continue
             self.unexpected += 1
+            if message.arbitration_id in self.reply_ids:
+                self.rejected += 1
             if self.listener is not None:
                 self.listener(message.arbitration_id, bytes(data))
         self._measure_load(now)
@@ -216,6 +234,8 @@ class Transport:
             "received": self.received,
             "error_frames": self.error_frames,
             "unexpected": self.unexpected,
+            "rejected": self.rejected,
+            "withheld": self.withheld,
             "send_failures": self.send_failures,
             "load": self._load,
             "state": self.state,
@@ -233,6 +253,13 @@ class Transport:
         except (can.CanError, OSError):
             # An interface that has vanished cannot be closed properly; nothing is left to release.
             self.state = "gone"
+
+    def _is_withheld(self, frames: Sequence[tuple[int, bytes]]) -> bool:
+        assert self.inspector is not None
+        self.refusal = self.inspector(frames)
+        if self.refusal:
+            self.withheld += len(frames)
+        return bool(self.refusal)
 
     # --- trouble ----------------------------------------------------------------------------------------------------
 

@@ -62,6 +62,9 @@ class RecordingArm(Arm):
         self.calls.append("disable")
         self.arm.disable()
 
+    def inspect_with(self, inspector) -> None:
+        self.arm.inspect_with(inspector)
+
     def clear_faults(self) -> None:
         self.calls.append("clear_faults")
         self.arm.clear_faults()

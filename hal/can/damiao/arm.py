@@ -5,11 +5,11 @@ confirmed by the drives. A cycle is one frame per joint and one reply each: the 
 the sample of the next one, stamped with the time it arrived.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from robotctl.hal.arm import Arm
+from robotctl.hal.arm import Arm, Inspector
 from robotctl.hal.can.channel import Channel, open_channel
 from robotctl.hal.can.damiao.codec import KD_MAX, KP_MAX, Special, Status
 from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, DrivesError, Identity, raise_problems
@@ -37,15 +37,11 @@ _BUS_OFF = Fault(
     "bus", 0x40, "BUS_OFF", "the controller left the bus after too many errors; check cable and termination"
 )
 
-Inspector = Callable[[Sequence[tuple[int, bytes]]], str]
-"""Sees the encoded frames (id, data) of a cycle before they leave. Any text it returns keeps them all back."""
-
 
 class DamiaoArm(Arm):
     """Fulfils `Arm` on a CAN channel, which is opened by `connect` and not before.
 
     `warnings` holds what bring-up put right, `identities` what the drives said of themselves, by joint.
-    `inspector`, where set, has the last word on every cycle of motion frames.
     """
 
     def __init__(self, robot: Robot, clock: Clock, channel: str) -> None:
@@ -61,7 +57,7 @@ class DamiaoArm(Arm):
             )
         self.warnings: list[str] = []
         self.identities: dict[str, Identity] = {}
-        self.inspector: Inspector | None = None
+        self._inspector: Inspector | None = None
         self.gripper: DamiaoGripper | None = None
         self._robot = robot
         self._clock = clock
@@ -90,6 +86,11 @@ class DamiaoArm(Arm):
         self._enabled = False
         self._polled_ns = 0
 
+    def inspect_with(self, inspector: Inspector) -> None:
+        self._inspector = inspector
+        if self._transport is not None:
+            self._transport.inspector = inspector.frames
+
     # --- life -------------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
@@ -103,6 +104,8 @@ class DamiaoArm(Arm):
                 "leave out --fast, or use --channel emulated",
             )
         transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
+        if self._inspector is not None:
+            transport.inspector = self._inspector.frames
         self._channel, self._transport = channel, transport
         self._verified = self._enabled = False
         self._drives = [
@@ -209,6 +212,8 @@ class DamiaoArm(Arm):
             np.array([drive.stamp_ns for drive in joints], dtype=np.int64),
             faults,
             enabled,
+            np.array([max(drive.mosfet_temperature, drive.rotor_temperature) for drive in joints], dtype=np.float64),
+            transport.rejected,
         )
 
     def write(self, command: Command) -> Sent:
@@ -235,25 +240,23 @@ class DamiaoArm(Arm):
                 )
             ]
         except (ValueError, OverflowError):
-            return Sent(command, "not sent: a value is not finite, or there are not as many as joints")
-        if self.inspector is not None:
-            refusal = self.inspector(frames)
-            if refusal:
-                return Sent(command, f"not sent: {refusal}")
+            text = "not sent: a value is not finite, or there are not as many as joints"
+            return Sent(command, text, delivered=False)
         now = self._clock.now_ns()
-        for drive in joints:
+        count = transport.send_all(frames)
+        if transport.refusal:
+            return Sent(command, f"not sent: {transport.refusal}", delivered=False)
+        for drive in joints[:count]:
             if drive.reply_pending:
                 drive.missed += 1
             drive.reply_pending = True
             drive.sent_ns = now
-        count = transport.send_all(frames)
         if transport.simulated:
             # The replies are there already: stamp them now, not one tick later.
             transport.drain()
         if count < len(frames):
-            for drive in joints[count:]:
-                drive.reply_pending = False
-            return Sent(command, f"{len(frames) - count} frames were not sent: the transmit queue is full")
+            text = f"{len(frames) - count} frames were not sent: the transmit queue is full"
+            return Sent(command, text, delivered=False)
         for drive in joints:
             if drive.saturated or drive.status != 1:
                 return self._altered(command, frames)

@@ -133,6 +133,7 @@ class Drive:
         self._replies: list[bytes] = []
         self.adopt(ranges)
         transport.routes[route_key(reply_id, motor_id)] = self.accept
+        transport.reply_ids.add(reply_id)
 
     def adopt(self, ranges: Ranges, fold: float = 0.0) -> None:
         """Use these full-scale ranges, and add `fold` (rad) to every joint angle: a wake-up may be a turn off."""

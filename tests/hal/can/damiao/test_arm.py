@@ -197,11 +197,17 @@ def test_values_that_are_not_finite_are_not_sent(bench, bad, index):
 
 
 def test_the_inspector_keeps_frames_back(bench):
+    class Refusing:
+        def frames(self, frames):
+            return f"{len(frames)} refused"
+
     bench.running()
-    bench.arm.inspector = lambda frames: f"{len(frames)} refused"
+    bench.arm.inspect_with(Refusing())
     bench.bus.sent.clear()
-    assert bench.arm.write(command(bench)).altered == "not sent: 7 refused"
+    sent = bench.arm.write(command(bench))
+    assert (sent.altered, sent.delivered) == ("not sent: 7 refused", False)
     assert bench.bus.sent == []
+    assert bench.arm.bus_statistics()["withheld"] == 7
 
 
 def test_a_mute_joint_keeps_its_stamp_and_is_counted(bench):
