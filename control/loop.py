@@ -16,9 +16,11 @@ from robotctl.control.publisher import Publisher
 from robotctl.control.shared import Link
 from robotctl.hal.backend import Rig
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import RobotctlError
+from robotctl.hal.errors import BusError, RobotctlError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, Sample, Vector
+from robotctl.safety.deadman import Grip
+from robotctl.safety.guard import Guard
 from robotctl.safety.machine import ENABLED, Event, Refused, State, after
 from robotctl.safety.routines import Goto, Retreat, Routine, Settle
 from robotctl.safety.supervisor import Supervisor
@@ -68,6 +70,8 @@ class Loop:
         """Servo periods that passed without a tick before the present one; set by whoever paces the loop."""
         self._arm = rig.arm
         self._gripper = rig.gripper
+        self._guard = Guard(robot, lambda: self.supervisor.state)
+        rig.arm.inspect_with(self._guard)
         self._clock = clock
         self._link = link
         self._motion = Motion(robot, self.kinematics)
@@ -119,12 +123,25 @@ class Loop:
     # -- the tick -------------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """Do everything that is due in one servo period."""
+        """Do everything that is due in one servo period.
+
+        Raises:
+            BusError: if the bus is gone; the arm is stopped by the drives' own watchdogs.
+        """
         now = self._clock.now_ns()
-        supervisor = self.supervisor
+        try:
+            self._tick(now)
+        except BusError as error:
+            self.supervisor.trip(Trip(Protection.BUS, Category.CUT, str(error), now))
+            self._publisher.report(self.supervisor, now)
+            raise
+
+    def _tick(self, now: int) -> None:
+        supervisor, motion = self.supervisor, self._motion
         if self._link.desk.take_stop():
             self._serve_estop("the operator", now)
         self._watch_operator(now)
+        supervisor.deadman.take(Grip(self._link.desk.grip), now)
         if self._estop:
             source, self._estop = self._estop, ""
             self._serve_estop(source, now)
@@ -133,9 +150,10 @@ class Loop:
             self._serve(*request, now)
             if self.closed:
                 return
-        sample = self._arm.read()
+        sample = supervisor.screen(self._arm.read())
+        self._guard.observe(sample, now, self.lateness_ns)
         tool = self.kinematics.tool(sample.position)
-        supervisor.observe(sample, tool, self._motion.reference.position, now)
+        supervisor.observe(sample, tool, motion.reference.position, motion.reference.velocity, now)
         target = self._link.mailbox.take()
         if target is not None:
             supervisor.offer(target, now)
@@ -145,8 +163,9 @@ class Loop:
             self._cut(sample, now)
         if self._gripper is not None:
             self._gripper.step()
+        self._take_refusal(now)
         self._publisher.report(supervisor, now)
-        self._publisher.record(supervisor, self._motion, sample, tool, self._arm.truth(), self.lateness_ns, now)
+        self._publisher.record(supervisor, motion, sample, tool, self._arm.truth(), self.lateness_ns, now)
         self._give_answer(now)
 
     def _drive(self, sample: Sample, now: int) -> None:
@@ -166,11 +185,33 @@ class Loop:
         if torque is not None:
             pushed = motion.push(torque, sample)
             if isinstance(pushed, Command):
-                self._arm.write(pushed)
+                self._write(pushed)
                 return
             supervisor.trip(pushed)
+            wanted = motion.rest
         periods = 1 + min(self.skipped, _LARGEST_GAP)
-        self._arm.write(motion.track(wanted, sample, brake=supervisor.category is Category.BRAKE_OFF, periods=periods))
+        brakes = supervisor.category is Category.BRAKE_OFF
+        self._write(motion.track(wanted, sample, brake=brakes, periods=periods))
+        if self._take_refusal(now):
+            # What the guard refused is taken back, and the braking that it asked for begins in this very tick.
+            motion.take_back()
+            self._write(motion.track(motion.rest, sample, brake=True))
+            if self._take_refusal(now):
+                motion.take_back()
+
+    def _write(self, command: Command) -> None:
+        self.supervisor.bus.sent(delivered=self._arm.write(command).delivered)
+
+    def _take_refusal(self, now: int) -> bool:
+        """Stop the arm for what the guard has refused, if anything; at once if it was braking already."""
+        refusal = self._guard.take()
+        if refusal is None:
+            return False
+        braking = self.supervisor.category in (Category.BRAKE_OFF, Category.CUT)
+        category = Category.CUT if braking else Category.BRAKE_OFF
+        cause = f"the guard kept a message back: {refusal.text}; this is a bug, keep the recording"
+        self.supervisor.trip(Trip(refusal.protection, category, cause, now))
+        return True
 
     def _cut(self, sample: Sample, now: int) -> None:
         """The profile's category 0 action: drives off, or damped with gravity compensated until told otherwise."""
@@ -243,13 +284,14 @@ class Loop:
         supervisor = self.supervisor
         match verb:
             case Verb.ARM:
+                after(supervisor.state, Event.ARM)
+                if not supervisor.stands(self._arm.read()):
+                    raise RobotctlError("ARM is refused: the arm is moving (P21)", "wait until it stands")
                 supervisor.handle(Event.ARM)
                 self._enable(now)
             case Verb.START:
-                if supervisor.recovery:
-                    raise Refused(supervisor.state, Event.START)
                 supervisor.handle(Event.START)
-                supervisor.admission.renew(now)
+                supervisor.admission.begin(now)
             case Verb.HOME:
                 self._reset(Goto(self.robot, np.array(self.robot.profile.home), "home", self.kinematics), now)
             case Verb.PARK:

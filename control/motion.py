@@ -14,11 +14,6 @@ from robotctl.safety.shaper import Clip, Shaper
 from robotctl.safety.torque import StoppableMotion
 from robotctl.safety.trip import Trip
 
-_FASTEST = 3.0
-"""Multiple of a joint's velocity cap that a measurement may tell of and be believed."""
-_NOISE = 0.01
-"""rad"""
-
 
 class Motion:
     """Makes one command per tick. `wanted`, `clip` and `command` tell of the last one."""
@@ -27,6 +22,7 @@ class Motion:
         self.rest = np.zeros(robot.dof)
         """What is wanted of an arm that is to brake and stay."""
         self.reference = Reference(robot, kinematics)
+        self._before = self.reference.mark()
         self.wanted: Vector = self.rest
         self.clip = Clip.NONE
         self.command = Command(CommandMode.TRACK, self.rest, self.rest, self.rest)
@@ -36,14 +32,13 @@ class Motion:
         self._torque_limiter = TorqueLimiter(robot)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
-        self._farthest = _FASTEST * robot.limits.velocity * robot.period_ns * 1e-9 + _NOISE
-        """Way that a joint may have gone since the last sample (n,), rad; further, and the sample is not believed."""
 
     def begin(self, position: Vector) -> Command:
         """Return the command that holds a measured pose, and lead on from there."""
         self._torque = None
         self.reference.resync(position, self.rest)
-        return Command(CommandMode.TRACK, position, self.rest, self._kinematics.gravity(position))
+        self.reference.effort = self._kinematics.gravity(position)
+        return Command(CommandMode.TRACK, position, self.rest, self.reference.effort)
 
     def track(self, wanted: Vector, sample: Sample, *, brake: bool, periods: int = 1) -> Command:
         """Return the command for joint velocities (n,), rad/s; with `brake`, for stopping as fast as the caps allow.
@@ -54,13 +49,16 @@ class Motion:
         reference = self.reference
         if self._torque is not None:
             self._torque = None
-            # One broken frame must not become the pose that the drives are pulled to: then the last one stays.
-            if (np.abs(sample.position - reference.position) <= periods * self._farthest).all():
-                reference.resync(sample.position, sample.velocity)
+            reference.resync(sample.position, sample.velocity)
         self.wanted, self.clip = wanted, Clip.NONE
+        self._before = reference.mark()
         for _ in range(periods):
             self.command = reference.step(self._shape(wanted, brake), sample.position)
         return self.command
+
+    def take_back(self) -> None:
+        """Go back to before the last command of `track`: it did not leave."""
+        self.reference.restore(self._before)
 
     def _shape(self, wanted: Vector, brake: bool) -> Vector:
         reference = self.reference
@@ -83,8 +81,8 @@ class Motion:
         trip = self._stoppable.check(sample)
         if trip is not None:
             return trip
-        previous = self.command.effort if self._torque is None else self._torque
-        self._torque = self._torque_limiter.step(self._kinematics.gravity(sample.position) + torque, previous)
+        wanted = self._kinematics.gravity(sample.position) + torque
+        self._torque = self.reference.effort = self._torque_limiter.step(wanted, self.reference.effort)
         self.reference.resync(sample.position, sample.velocity)
         self.wanted, self.clip = torque, Clip.NONE
         self.command = Command(CommandMode.EFFORT, sample.position, self.rest, self._torque)

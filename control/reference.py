@@ -27,6 +27,8 @@ class Reference:
         self.position: Vector = np.zeros(n)
         self.velocity: Vector = np.zeros(n)
         self.acceleration: Vector = np.zeros(n)
+        self.effort: Vector = np.zeros(n)
+        """Feed-forward of the last command (n,), Nm."""
         self._dt = robot.period_ns * 1e-9
         self._kinematics = kinematics
         self._ki = self._dt * np.array([joint.gains.ki for joint in robot.profile.joints])
@@ -42,6 +44,14 @@ class Reference:
         self.velocity = np.minimum(np.maximum(velocity, -self._velocity_cap), self._velocity_cap)
         self.acceleration = np.zeros_like(self.position)
         self._bias = np.zeros_like(self.position)
+
+    def mark(self) -> tuple[Vector, ...]:
+        """Return what `restore` needs to come back here."""
+        return self.position, self.velocity, self.acceleration, self.effort, self._bias
+
+    def restore(self, mark: tuple[Vector, ...]) -> None:
+        """Come back to where `mark` was called."""
+        self.position, self.velocity, self.acceleration, self.effort, self._bias = mark
 
     def step(self, velocity: Vector, measured: Vector) -> Command:
         """Advance one servo period to `velocity` and return the command for it.
@@ -60,9 +70,8 @@ class Reference:
             effort += kinematics.friction * np.tanh(velocity / _SLOW)
         if velocity @ velocity < _SLOW**2:
             self._integrate(measured)
-        return Command(
-            CommandMode.TRACK, self.position, velocity, np.minimum(np.maximum(effort, -self._cap), self._cap)
-        )
+        self.effort = np.minimum(np.maximum(effort, -self._cap), self._cap)
+        return Command(CommandMode.TRACK, self.position, velocity, self.effort)
 
     def _integrate(self, measured: Vector) -> None:
         error = self.position - measured

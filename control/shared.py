@@ -92,8 +92,8 @@ class Desk:
     emergency stop has a word of its own: pressed in another thread, it must neither lose nor replace a request.
     """
 
-    SIZE = 40
-    """Words: asked, answered, verb, stops, beats. The answer's text goes through the event ring."""
+    SIZE = 48
+    """Words: asked, answered, verb, stops, beats, grip. The answer's text goes through the event ring."""
 
     def __init__(self, buffer: Buffer, offset: int = 0) -> None:
         self._words = _words(buffer, offset, self.SIZE // 8)
@@ -129,6 +129,15 @@ class Desk:
     def beats(self) -> int:
         """Number of beats so far; 0 where the operator's process shows no life, as in lockstep."""
         return self._words[4]
+
+    def hold(self, grip: int) -> None:
+        """Tell how the deadman's switch is held. May be called from any thread."""
+        self._words[5] = grip
+
+    @property
+    def grip(self) -> int:
+        """How the deadman's switch is held."""
+        return self._words[5]
 
     def take_stop(self) -> bool:
         """Return whether an emergency stop was posted since the last call."""

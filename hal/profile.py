@@ -148,6 +148,30 @@ class Safety(_Strict):
     """Published tolerance: how far true joint speed may exceed its cap, rad/s."""
     tracking_error: Positive = 0.15
     """Distance between reference and measurement at which the arm is stopped, rad."""
+    tracking_speed: Positive = 0.1
+    """Difference between reference and measured joint speed at which the arm is stopped, rad/s ..."""
+    tracking_speed_share: NotNegative = 0.3
+    """... plus this share of the joint's velocity cap ..."""
+    tracking_time_s: Positive = 0.05
+    """... if it lasts for so long."""
+    standstill_drift: Positive = 0.05
+    """Way that a joint may creep while the arm holds, before its torque is taken away, rad."""
+    overspeed: Annotated[float, Field(gt=1.0)] = 1.2
+    """Multiple of a velocity cap at which three samples stop the arm."""
+    overspeed_cut: Annotated[float, Field(gt=1.0)] = 1.5
+    """Multiple of a velocity cap at which its torque is taken away."""
+    bump: Positive = 0.02
+    """How far from the measured pose the first command after enabling may be, rad."""
+    track_step: Annotated[float, Field(gt=0.0, le=1.0)] = 0.6
+    """Share of a joint's torque cap by which the feed-forward may jump while it tracks: when full braking sets in."""
+    power: Positive = 500.0
+    """Largest mechanical power of all joints together, W."""
+    temperature: Positive = 90.0
+    """Drive temperature at which the arm is stopped, degrees Celsius; from 10 below, it is warned of."""
+    rejected_frames: Annotated[int, Field(ge=1)] = 5
+    """Measurements within a second that cannot be believed, at which the arm is stopped."""
+    deadman_stuck_s: Positive = 30.0
+    """Time after which a deadman's switch has to be released and pressed anew."""
     heartbeat_s: Positive = 0.1
     """Time without a fresh target after which the arm brakes."""
     heartbeat_grace_s: Positive = 0.5

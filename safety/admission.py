@@ -27,6 +27,11 @@ class Admission:
         self.refused = 0
         """Targets dropped for an old epoch, an old sequence number or a deadline that had passed."""
 
+    def begin(self, now_ns: int) -> None:
+        """Begin with any sequence number: the policy may be a new one. For the operator's START."""
+        self.seq = -1
+        self.renew(now_ns)
+
     def renew(self, now_ns: int) -> None:
         """Forget the target; the policy has one heartbeat from now to send the next. For entries into RUN."""
         self._target = None

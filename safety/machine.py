@@ -98,6 +98,7 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
     (S.STOPPING, E.CLEARED): S.RUN,
     (S.HOLD, E.CLEARED): S.RUN,
     (S.HOLD, E.ACK): S.ARMED,
+    (S.HOLD, E.START): S.RUN,  # where the cause of the stop takes START as acknowledgement
     # After a fault the self-test runs again.
     (S.FAULT, E.ACK): S.SILENT,
     (S.SILENT, E.CLOSE): S.OFF,
@@ -112,8 +113,8 @@ ENABLED = frozenset(_MOVING)
 class Refused(Exception):  # noqa: N818 - an answer more than an error
     """An event that its state does not allow."""
 
-    def __init__(self, state: State, event: Event) -> None:
-        super().__init__(f"{event.name} is refused in state {state.name}")
+    def __init__(self, state: State, event: Event, why: str = "") -> None:
+        super().__init__(f"{event.name} is refused in state {state.name}{': ' if why else ''}{why}")
         self.state = state
         self.event = event
 

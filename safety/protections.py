@@ -1,7 +1,8 @@
-"""Protections that judge what was measured. Each is one small function or class, named after what it protects.
+"""Protections that judge where the arm was measured, and how long ago: P3, P5 and P12.
 
-All of them are asked in every tick by the supervisor and answer with a `Trip` or None. Those that shape commands
-instead (velocity, acceleration, position and sphere) live in `shaper.py`; those that judge targets in `admission.py`.
+The supervisor asks each in every tick; it answers with a `Trip` or None. How the arm moves is judged in `tracking.py`,
+its drives in `drives.py`, whether a measurement can be true in `believable.py`. Those that shape commands live in
+`shaper.py`, those that judge targets in `admission.py`, and what leaves for the drives is judged by `guard.py`.
 """
 
 import math
@@ -68,11 +69,14 @@ class FeedbackAge:
         """Whether the reference is to be braked to rest."""
         self.lost = False
         """Whether nothing is known of the arm any more."""
+        self.dead = False
+        """Whether not one joint is heard of: the drives have no power."""
 
     def check(self, sample: Sample, now_ns: int) -> Trip | None:
         age = now_ns - int(sample.joint_stamp_ns.min())
         self.stale = age > self._stop_ns
         self.lost = age > self._fault_ns
+        self.dead = now_ns - int(sample.joint_stamp_ns.max()) > self._fault_ns
         if not self.lost:
             return None
         joint = int(sample.joint_stamp_ns.argmin())
@@ -82,36 +86,3 @@ class FeedbackAge:
             "check its power, its connector and the bus, then acknowledge"
         )
         return Trip(Protection.FEEDBACK, Category.BRAKE_OFF, cause, heard + self._fault_ns)
-
-
-class TrackingError:
-    """P17: the arm does not follow its reference: a stuck joint, a collision, a wrong sign, an unknown load."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._names = [joint.name for joint in robot.profile.joints]
-        self._largest = robot.profile.safety.tracking_error
-
-    def check(self, sample: Sample, reference: Vector) -> Trip | None:
-        error = np.abs(reference - sample.position)
-        joint = int(error.argmax())
-        if error[joint] <= self._largest:
-            return None
-        cause = (
-            f"{self._names[joint]} is {error[joint]:.3f} rad away from where it was led; "
-            "look for a collision, a stuck joint or an unknown load, then acknowledge"
-        )
-        return Trip(Protection.TRACKING, Category.BRAKE_OFF, cause, sample.stamp_ns)
-
-
-class DriveHealth:
-    """P24: a drive reports a fault, or lost its torque while the arm should hold."""
-
-    def check(self, sample: Sample, *, expect_enabled: bool) -> Trip | None:
-        if sample.faults:
-            fault = sample.faults[0]
-            cause = f"{fault.joint}: drive reports {fault.name} (code 0x{fault.code:X}); {fault.hint}"
-            return Trip(Protection.DRIVE, Category.BRAKE_OFF, cause, sample.stamp_ns)
-        if expect_enabled and not sample.enabled:
-            cause = "a drive went off by itself; check its power and watchdog, then acknowledge"
-            return Trip(Protection.DRIVE, Category.BRAKE_OFF, cause, sample.stamp_ns)
-        return None

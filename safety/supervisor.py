@@ -9,10 +9,14 @@ import numpy as np
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
 from robotctl.safety.admission import Admission
-from robotctl.safety.machine import ENABLED, Event, State, after
-from robotctl.safety.protections import DriveHealth, FeedbackAge, PositionBreach, SphereBreach, TrackingError
+from robotctl.safety.believable import Believable
+from robotctl.safety.deadman import Deadman
+from robotctl.safety.drives import BusHealth, DriveHealth
+from robotctl.safety.machine import ENABLED, Event, Refused, State, after
+from robotctl.safety.protections import FeedbackAge, PositionBreach, SphereBreach
 from robotctl.safety.target import Hold, Target
-from robotctl.safety.trip import Category, Protection, Trip
+from robotctl.safety.tracking import Drift, Overspeed, ToolSpeed, TrackingError
+from robotctl.safety.trip import Category, Clearing, Protection, Trip
 
 _TRIP_EVENTS = {
     Category.BRAKE_HOLD: Event.TRIP_HOLD,
@@ -29,6 +33,7 @@ class Supervisor:
     """State machine, protections and admission of one arm."""
 
     def __init__(self, robot: Robot) -> None:
+        safety = robot.profile.safety
         self.state = State.OFF
         self.epoch = 0
         """Raised by every stop and every entry to ARMED; targets of an older epoch are dropped."""
@@ -42,16 +47,23 @@ class Supervisor:
         """Every trip of this supervisor's life, oldest first."""
         self.admission = Admission(robot)
         self.feedback = FeedbackAge(robot)
+        self.deadman = Deadman(robot)
+        self.bus = BusHealth()
+        self.drives = DriveHealth(robot)
+        self._believable = Believable(robot)
         self._position = PositionBreach(robot)
         self._sphere = SphereBreach(robot)
         self._tracking = TrackingError(robot)
-        self._drives = DriveHealth()
-        self._standstill = robot.profile.safety.standstill
-        self._grace_ns = round(robot.profile.safety.heartbeat_grace_s * 1e9)
+        self._drift = Drift(robot)
+        self._overspeed = Overspeed(robot)
+        self._tool_speed = ToolSpeed(robot)
+        self._standstill = safety.standstill
+        self._grace_ns = round(safety.heartbeat_grace_s * 1e9)
         self._stopping_limit_ns = round((robot.stopping_time_s + _STOP_ALLOWANCE_S) * 1e9)
         self._stopping_since_ns: int | None = None
         self._settled = 0
         self._was_running = False
+        self._power_cycled = False
 
     # -- what happens to it ---------------------------------------------------------------------------------------
 
@@ -61,7 +73,11 @@ class Supervisor:
         Raises:
             Refused: if the present state does not allow it.
         """
-        before, self.state = self.state, after(self.state, event)
+        before, following = self.state, after(self.state, event)
+        why = self._objection(event)
+        if why:
+            raise Refused(before, event, why)
+        self.state = following
         match event:
             case Event.STOP | Event.DISARM:
                 category = Category.BRAKE_HOLD if event is Event.STOP else Category.BRAKE_OFF
@@ -69,12 +85,14 @@ class Supervisor:
                 self._was_running = False  # a heartbeat that comes back does not undo what the operator did
             case Event.ARM | Event.ACK | Event.RESET_DONE | Event.OFF_CLEAN:
                 self._raise_epoch(None)
-                if event is Event.ACK:
+                if event is Event.ARM:
+                    self._believable.forget()
+                elif event is Event.ACK:
                     self.recovery = self.cause is not None and self.cause.protection in _RECOVERABLE
-                    self.cause = None
                 elif event is Event.RESET_DONE:
                     self.recovery = False
-            case Event.CLEARED:
+                self.cause = None
+            case Event.CLEARED | Event.START:
                 self.category = None
                 self.cause = None
         if before is not self.state:
@@ -104,46 +122,68 @@ class Supervisor:
             pass  # the drives are going off already; with a cause they end in FAULT
         else:
             return False
+        self._power_cycled = False
         self.cause = trip
         self.trips.append(trip)
         return True
 
     # -- asked in every tick --------------------------------------------------------------------------------------
 
-    def observe(self, sample: Sample, tool: Vector, reference: Vector, now_ns: int) -> None:
+    def screen(self, sample: Sample) -> Sample:
+        """Return what can be believed of a sample. Comes before everything else that looks at it."""
+        if self.state not in ENABLED:
+            self._believable.forget()
+        return self._believable.screen(sample)
+
+    def observe(self, sample: Sample, tool: Vector, position: Vector, velocity: Vector, now_ns: int) -> None:
         """Judge a sample: trips, standstill, automatic clearing.
 
         Args:
+            sample: what `screen` left of it.
             tool: measured tool point (3,), m.
-            reference: where the drives are led (n,), rad.
+            position: where the drives are led (n,), rad.
+            velocity: how they are led (n,), rad/s.
+            now_ns: the present time.
         """
-        state = self.state
         silent = self.feedback.check(sample, now_ns)  # in every state: an arm is damped with the drives on, too
-        if state not in ENABLED:
+        if self.feedback.dead:
+            self._power_cycled = True
+        if self.state not in ENABLED:
             return
-        trip = (
-            self._drives.check(sample, expect_enabled=True)
-            or silent
-            or (None if self.recovery else self._position.check(sample))
-            or self._tracking.check(sample, reference)
-            # Category 2 comes last, so that it does not hide a harder stop.
-            or (None if self.recovery else self._sphere.check(tool, sample.stamp_ns))
-        )
-        if trip is None and state is State.RUN:
-            trip = self.admission.heartbeat(now_ns)
-        if trip is not None:
-            self.trip(trip)
+        trips = [
+            silent,
+            self.bus.check(sample),
+            self._believable.check(now_ns),
+            self.drives.check(sample),
+            self._tracking.check(sample, position, velocity),
+            self._drift.check(sample, holding=self.state is State.HOLD),
+            self._overspeed.check(sample),
+            self._tool_speed.check(tool, sample.stamp_ns, slow=self.state is State.RESET),
+        ]
+        if not self.recovery:
+            trips += [self._position.check(sample), self._sphere.check(tool, sample.stamp_ns)]
+        if self.state in _MOVING:
+            trips.append(self.deadman.check(now_ns))
+        if self.state is State.RUN:
+            trips.append(self.admission.heartbeat(now_ns))
+        found = [trip for trip in trips if trip is not None]
+        if found:
+            self.trip(min(found, key=lambda trip: trip.category))
         if self.state is State.STOPPING:
             self._watch_standstill(sample, now_ns)
         else:
             self._stopping_since_ns = None
-        if self.state in (State.STOPPING, State.HOLD):
-            self._clear_heartbeat(now_ns)
+        if self.state in (State.STOPPING, State.HOLD) and self._was_running:
+            self._clear(now_ns)
 
     def begin_recovery_if_outside(self, sample: Sample, tool: Vector) -> None:
         """When armed outside its limits or its sphere, the arm may do nothing but retreat."""
         if not self._position.inside(sample.position) or self._sphere.outside(tool) > 0.0:
             self.recovery = True
+
+    def stands(self, sample: Sample) -> bool:
+        """Return whether every joint was measured at rest."""
+        return bool((np.abs(sample.velocity) < self._standstill).all())
 
     def offer(self, target: Target, now_ns: int) -> None:
         """Take a new target from the mailbox; malformed ones stop the arm."""
@@ -161,6 +201,20 @@ class Supervisor:
 
     # -- inside ---------------------------------------------------------------------------------------------------
 
+    def _objection(self, event: Event) -> str:
+        """Return why an event that the state allows is refused all the same."""
+        clearing = self.cause.protection.clearing if self.cause else Clearing.ACK
+        match event:
+            case Event.START | Event.RESET if not self.deadman.permits:
+                return "the deadman's switch is not held"
+            case Event.START if self.recovery:
+                return "the arm is outside its limits; retreat first"
+            case Event.START if self.state is State.HOLD and clearing is not Clearing.START:
+                return "acknowledge first"
+            case Event.ACK if self.state is State.FAULT and clearing is Clearing.POWER and not self._power_cycled:
+                return "switch the power of the drives off and on first"
+        return ""
+
     def _raise_epoch(self, category: Category | None) -> None:
         self.epoch += 1
         self.category = category
@@ -168,23 +222,26 @@ class Supervisor:
     def _watch_standstill(self, sample: Sample, now_ns: int) -> None:
         if self._stopping_since_ns is None:
             self._stopping_since_ns = now_ns
-        at_rest = bool((np.abs(sample.velocity) < self._standstill).all())
-        self._settled = self._settled + 1 if at_rest else 0
+        self._settled = self._settled + 1 if self.stands(sample) else 0
         # A joint that is not heard of, or that somebody shakes, must not keep a stop from ending.
         overdue = now_ns - self._stopping_since_ns > self._stopping_limit_ns
         if self._settled >= _STANDSTILL_TICKS or overdue:
             self.handle(Event.STANDSTILL_HOLD if self.category is Category.BRAKE_HOLD else Event.STANDSTILL_OFF)
 
-    def _clear_heartbeat(self, now_ns: int) -> None:
-        """A heartbeat that comes back in time resumes; later the stop is latched."""
+    def _clear(self, now_ns: int) -> None:
+        """Go on by itself: after a heartbeat that comes back in time, and when a deadman's switch is held again."""
         cause = self.cause
-        if cause is None or cause.protection is not Protection.HEARTBEAT or not self._was_running:
-            return
-        if now_ns - cause.onset_ns > self._grace_ns:
-            self._was_running = False
-        elif self.admission.fresh(now_ns) is not None:
-            self.handle(Event.CLEARED)
+        assert cause is not None  # a trip out of RUN
+        match cause.protection:
+            case Protection.HEARTBEAT if now_ns - cause.onset_ns > self._grace_ns:
+                self._was_running = False
+            case Protection.HEARTBEAT if self.admission.fresh(now_ns) is not None:
+                self.handle(Event.CLEARED)
+            case Protection.DEADMAN if self.deadman.permits and self.state is State.HOLD:
+                self.admission.renew(now_ns)
+                self.handle(Event.CLEARED)
 
 
 _SOFT_TRIPPABLE = (State.ARMED, State.RUN, State.RESET)
+_MOVING = (State.RUN, State.RESET)
 _LISTENING = (State.RUN, State.STOPPING, State.HOLD)

@@ -30,6 +30,7 @@ class Protection(IntEnum):
     """The protections, numbered as in docs/safety.md."""
 
     VELOCITY = 1
+    SOFT_LIMIT = 2
     POSITION = 3
     SPHERE = 5
     ACCELERATION = 6
@@ -47,12 +48,13 @@ class Protection(IntEnum):
     CONTACT = 19
     PROXIMITY = 20
     BUMP = 21
-    OPERATOR = 22
+    DEADMAN = 22
     ESTOP = 23
     DRIVE = 24
     WEIGHTS = 26
     WATCHMAN = 27
     RESET = 29
+    OPERATOR = 30
 
     @property
     def label(self) -> str:
@@ -68,6 +70,7 @@ _CLEARING = {
     Protection.HEARTBEAT: Clearing.START,
     # A guard that tripped has met a bug, and a drive that failed keeps what it knows to itself.
     Protection.VELOCITY: Clearing.POWER,
+    Protection.SOFT_LIMIT: Clearing.POWER,
     Protection.ACCELERATION: Clearing.POWER,
     Protection.TORQUE: Clearing.POWER,
     Protection.FRAMES: Clearing.POWER,

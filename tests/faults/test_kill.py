@@ -137,5 +137,5 @@ def test_a_suspended_operator_does_not_leave_the_arm_moving(start: Any) -> None:
     status, output, report = run.finish()
     assert status == 3, output
     trip = report["safety"]["trips"][0]
-    assert (trip["protection"], trip["stop_category"]) == ("P22", 2)
+    assert (trip["protection"], trip["stop_category"]) == ("P30", 2)
     assert trip["reaction_ms"] < 200.0

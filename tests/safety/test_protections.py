@@ -5,8 +5,8 @@ import pytest
 
 from robotctl.control.kinematics import Kinematics
 from robotctl.hal.robot import Robot, load_robot
-from robotctl.hal.types import Fault, Sample
-from robotctl.safety.protections import DriveHealth, FeedbackAge, PositionBreach, SphereBreach, TrackingError
+from robotctl.hal.types import Sample
+from robotctl.safety.protections import FeedbackAge, PositionBreach, SphereBreach
 from robotctl.safety.torque import StoppableMotion
 from robotctl.safety.trip import Category, Protection
 
@@ -98,23 +98,9 @@ def test_feedback_age(panda: Robot, joint):
             assert f"{panda.profile.joints[joint].name} has not answered for 50 ms" in trip.cause
 
 
-@pytest.mark.parametrize("step", STEPS)
-@pytest.mark.parametrize("side", [-1, 1])
-def test_tracking(robot: Robot, side, step):
-    check = TrackingError(robot)
-    for joint in range(robot.dof):
-        reference = np.zeros(robot.dof)
-        reference[joint] = side * (robot.profile.safety.tracking_error + step)
-        trip = check.check(sample(np.zeros(robot.dof)), reference)
-        assert (trip is not None) is (step > 0)
-        if trip is not None:
-            assert (trip.protection, trip.category) == (Protection.TRACKING, Category.BRAKE_OFF)
-            assert robot.profile.joints[joint].name in trip.cause
-
-
-@pytest.mark.parametrize("key", ["position_breach", "sphere_breach", "tracking_error"])
+@pytest.mark.parametrize("key", ["position_breach", "sphere_breach"])
 def test_thresholds_come_from_the_profile(key):
-    """At a distance of 0.4 all three trip by default, and none with a threshold of 0.5."""
+    """At a distance of 0.4 both trip by default, and none with a threshold of 0.5."""
     for robot, trips in ((load_robot("panda"), True), (load_robot("panda", [f"safety.{key}=0.5"]), False)):
         rest = np.array(robot.profile.home)
         beyond = rest.copy()
@@ -123,22 +109,8 @@ def test_thresholds_come_from_the_profile(key):
         found = {
             "position_breach": PositionBreach(robot).check(sample(beyond)),
             "sphere_breach": SphereBreach(robot).check(outside, 0),
-            "tracking_error": TrackingError(robot).check(sample(rest), rest + 0.4),
         }[key]
         assert (found is not None) is trips
-
-
-def test_drive_health():
-    check = DriveHealth()
-    rest = np.zeros(7)
-    assert check.check(sample(rest), expect_enabled=True) is None
-    assert check.check(sample(rest, enabled=False), expect_enabled=False) is None
-    off = check.check(sample(rest, enabled=False), expect_enabled=True)
-    assert (off.protection, off.category) == (Protection.DRIVE, Category.BRAKE_OFF)
-    faults = (Fault("joint2", 0xD, "COMMUNICATION_LOST", "look at the cable"), Fault("joint4", 0x9, "UNDERVOLTAGE", ""))
-    for expect in (True, False):
-        trip = check.check(sample(rest, faults=faults), expect_enabled=expect)
-        assert trip.cause == "joint2: drive reports COMMUNICATION_LOST (code 0xD); look at the cable"
 
 
 @pytest.mark.parametrize("field", ["position", "velocity"])
@@ -152,5 +124,4 @@ def test_a_measurement_that_is_no_number_is_never_fine(field: str) -> None:
     assert StoppableMotion(robot, Kinematics(robot)).check(sample) is not None
     if field == "position":
         assert PositionBreach(robot).check(sample) is not None
-        assert TrackingError(robot).check(sample, home) is not None
         assert SphereBreach(robot).check(np.array([np.nan, 0.0, 0.0]), 0) is not None

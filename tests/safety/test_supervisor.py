@@ -44,6 +44,7 @@ class Bench:
         self.position = HOME.copy()
         self.velocity = np.zeros(7)
         self.reference = None
+        self.led = None
         self.tool = CENTRE
         self.faults = ()
         self.enabled = True
@@ -56,7 +57,8 @@ class Bench:
             self.now, self.position, self.velocity, np.zeros(7), stamps, faults=self.faults, enabled=self.enabled
         )
         reference = self.position if self.reference is None else self.reference
-        self.supervisor.observe(sample, self.tool, reference, self.now)
+        velocity = self.velocity if self.led is None else self.led
+        self.supervisor.observe(sample, self.tool, reference, velocity, self.now)
         return self.supervisor.state
 
     def observe_until(self, at_ns):

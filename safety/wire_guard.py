@@ -1,0 +1,111 @@
+"""The guard's own reading of DAMIAO frames: what kind of message a frame is, and what motion it asks of which joint."""
+
+import math
+
+from robotctl.hal.can.damiao.codec import (
+    BROADCAST_ID,
+    KD_MAX,
+    KP_MAX,
+    Offset,
+    RegisterCommand,
+    Special,
+    decode_mit,
+    decode_pos_force,
+)
+from robotctl.hal.can.damiao.motors import MOTORS
+from robotctl.hal.can.damiao.registers import Register
+from robotctl.hal.profile import Drive, GripperProfile, RobotProfile
+from robotctl.safety.asked import Asked, Kind
+
+_SPECIALS: dict[int, Kind] = {
+    Special.ENABLE: Kind.ENABLE,
+    Special.DISABLE: Kind.DISABLE,
+    Special.CLEAR_ERROR: Kind.CLEAR,
+    Special.SET_ZERO: Kind.ZERO,
+}
+_PREFIX = b"\xff" * 7
+_HALF = 0.5005
+"""Half a step, and what floating point adds."""
+
+
+class WireJoint:
+    """One motor of the arm: its frames in joint coordinates."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.ranges = ranges = MOTORS[drive.motor]
+        self._scale = scale = drive.sign * drive.gear
+        self._offset = drive.offset
+        self._turn = 2.0 * math.pi / drive.gear
+        self._square = square = scale * scale
+        self.step = Asked(
+            _HALF * 2.0 * ranges.pmax / 0xFFFF / drive.gear,
+            _HALF * 2.0 * ranges.vmax / 0xFFF / drive.gear,
+            _HALF * KP_MAX / 0xFFF * square,
+            _HALF * KD_MAX / 0xFFF * square,
+            _HALF * 2.0 * ranges.tmax / 0xFFF * drive.gear,
+        )
+        """What rounding may cost each field."""
+
+    def asked(self, data: bytes, measured: float) -> Asked:
+        """Return what a motion frame asks. Of the turns that a single-turn encoder leaves open, the measured one."""
+        position, velocity, kp, kd, effort = decode_mit(data, self.ranges)
+        scale, square = self._scale, self._square
+        angle = position / scale + self._offset
+        if abs(measured - angle) > 0.5 * self._turn:
+            angle += math.copysign(self._turn, measured - angle)
+        return Asked(angle, velocity / scale, kp * square, kd * square, effort * scale)
+
+
+class WireGripper:
+    """The gripper's motor, in POS_FORCE mode."""
+
+    def __init__(self, gripper: GripperProfile, drive: Drive) -> None:
+        per_metre = abs(gripper.motor_open) / gripper.width
+        self._least, self._most = sorted((0.0, gripper.motor_open))
+        self._speed = gripper.speed * per_metre
+        self._current = min(gripper.force / per_metre / MOTORS[drive.motor].tmax, 1.0)
+
+    def fits(self, data: bytes) -> bool:
+        """Return whether a frame stays within the stroke, the speed and the force of the profile."""
+        angle, speed, current = decode_pos_force(data)
+        slack = 0.01 * (self._most - self._least)
+        # Fingers that stand a little outside their stroke are held where they are.
+        inside = self._least - 5.0 * slack <= angle <= self._most + 5.0 * slack
+        return inside and speed <= self._speed + slack and current <= self._current + 1e-3
+
+
+class WireGuard:
+    """Tells the kinds of all messages on an arm's bus."""
+
+    def __init__(self, profile: RobotProfile) -> None:
+        drives = [joint.drive for joint in profile.joints if joint.drive]
+        self.joints = [WireJoint(drive) for drive in drives]
+        self._index = {drive.id: index for index, drive in enumerate(drives)}
+        self._motors = set(self._index)
+        self._grip_id = -1
+        self._gripper: WireGripper | None = None
+        if profile.gripper and profile.gripper.drive:
+            drive = profile.gripper.drive
+            self._motors.add(drive.id)
+            self._grip_id = drive.id + Offset.POS_FORCE
+            self._gripper = WireGripper(profile.gripper, drive)
+
+    def kind(self, arbitration_id: int, data: bytes) -> Kind | int | None:
+        """Return what a frame is: the index of the joint that it moves, its kind, or None for a stranger."""
+        if len(data) != 8:
+            return None
+        if arbitration_id in self._motors:
+            if data[:7] == _PREFIX:
+                return _SPECIALS.get(data[7])
+            return self._index.get(arbitration_id)
+        if arbitration_id == self._grip_id and self._gripper is not None:
+            return Kind.GRIP if self._gripper.fits(data) else None
+        if arbitration_id == BROADCAST_ID and data[0] | data[1] << 8 in self._motors:
+            return _register_kind(data[2], data[3])
+        return None
+
+
+def _register_kind(command: int, register: int) -> Kind:
+    if command in (RegisterCommand.READ, RegisterCommand.REFRESH):
+        return Kind.READ
+    return Kind.MODE if (command, register) == (RegisterCommand.WRITE, Register.CTRL_MODE) else Kind.STORE
