@@ -22,6 +22,7 @@ from robotctl.hal.types import Command, Sample, Vector
 from robotctl.safety.deadman import Grip
 from robotctl.safety.guard import Guard
 from robotctl.safety.machine import ENABLED, Event, Refused, State, after
+from robotctl.safety.overrun import Overrun
 from robotctl.safety.routines import Goto, Retreat, Routine, Settle
 from robotctl.safety.supervisor import Supervisor
 from robotctl.safety.target import FreeDrive, JointTorque, JointVelocity
@@ -68,6 +69,7 @@ class Loop:
         """How late the present tick began; set by whoever paces the loop."""
         self.skipped = 0
         """Servo periods that passed without a tick before the present one; set by whoever paces the loop."""
+        self._overrun = Overrun(robot)
         self._arm = rig.arm
         self._gripper = rig.gripper
         self._guard = Guard(robot, lambda: self.supervisor.state)
@@ -138,6 +140,9 @@ class Loop:
 
     def _tick(self, now: int) -> None:
         supervisor, motion = self.supervisor, self._motion
+        overrun = self._overrun.check(self.lateness_ns, now)
+        if overrun is not None and supervisor.state in ENABLED:
+            supervisor.trip(overrun)
         if self._link.desk.take_stop():
             self._serve_estop("the operator", now)
         self._watch_operator(now)
@@ -338,6 +343,7 @@ class Loop:
         except RobotctlError as error:
             self.supervisor.trip(Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), now))
             raise
+        self._overrun.restart()
         sample = self._arm.read()
         self._motion.begin(sample.position)
         self.supervisor.begin_recovery_if_outside(sample, self.kinematics.tool(sample.position))

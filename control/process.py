@@ -90,16 +90,20 @@ def _run(loop: Loop, link: Link, clock: MonotonicClock, config: ProcessConfig) -
 
 
 def _pace(loop: Loop, clock: MonotonicClock, operator: int) -> None:
-    """Tick at absolute deadlines until the loop is closed. Missed deadlines are skipped, and the loop is told."""
+    """Tick at absolute deadlines until the loop is closed. Missed deadlines are skipped.
+
+    The loop is told before it ticks how many: so its reference has made as many steps as periods have passed, and
+    never runs ahead of wall time.
+    """
     period = loop.robot.period_ns
     deadline = clock.now_ns() + period
     while not loop.closed:
         clock.sleep_until(deadline)
         loop.lateness_ns = clock.now_ns() - deadline
+        loop.skipped = loop.lateness_ns // period
         loop.tick()
         if os.getppid() != operator and loop.supervisor.state in _CLOSABLE:
             loop.request(Verb.CLOSE)  # nobody is left who could ask for it
-        loop.skipped = max(0, (clock.now_ns() - deadline) // period)
         deadline += period * (1 + loop.skipped)
 
 

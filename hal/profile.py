@@ -190,6 +190,13 @@ class Safety(_Strict):
     """Fraction of the velocity caps that reset routines may use."""
     reset_tool_speed: Positive = 0.25
     """Tool speed during reset routines, m/s."""
+    overrun_ticks: Annotated[int, Field(ge=2)] = 5
+    """Ticks in a row, each late by more than a period, after which the arm is stopped."""
+    overrun_s: Positive = 0.020
+    """Time beyond a period between two ticks above which the arm is stopped for good."""
+    watchman_s: Positive = 0.050
+    """Time without a tick of an armed arm's loop after which the watchman takes its drives. Shorter than the drives'
+    own watchdogs, or they go off first."""
 
 
 class CanBus(_Strict):

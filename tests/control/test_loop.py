@@ -758,3 +758,44 @@ def test_a_late_tick_does_not_leave_the_reference_behind(told: bool) -> None:
             record = session.latest()
             worst = max(worst, np.abs(record["command_position"] - record["true_position"]).max())
         assert bool(worst < 1.5e-3) is told, worst
+
+
+def test_a_gap_between_ticks_brakes_and_switches_off(bench):
+    bench.reach(State.ARMED)
+    bench.lead(0.5, 0.5)
+    bench.clock.sleep_until(bench.clock.now_ns() + 25_000_000)
+    bench.loop.skipped = 12
+    assert bench.tick() is State.STOPPING
+    bench.loop.skipped = 0
+    bench.until(State.FAULT)
+    (trip,) = [event for event in bench.events() if event["type"] == "trip"]
+    assert (trip["protection"], trip["stop_category"]) == ("P11", 1)
+    assert trip["reaction_ms"] == pytest.approx(5.0)  # 27 ms after the last tick, where 22 are allowed
+
+
+def test_late_ticks_in_a_row_brake_and_hold(bench):
+    bench.reach(State.ARMED)
+    bench.loop.lateness_ns = bench.robot.period_ns + 1
+    assert bench.tick(4) is State.ARMED
+    assert bench.tick() is State.STOPPING
+    bench.until(State.HOLD)
+    assert [trip.protection.label for trip in bench.supervisor.trips] == ["P11"]
+
+
+def test_drives_that_take_their_time_to_come_on_are_no_overrun(bench):
+    bench.reach(State.READY)
+    enable = bench.arm.arm.enable
+
+    def slow():
+        bench.clock.sleep_until(bench.clock.now_ns() + 500_000_000)
+        enable()
+
+    bench.arm.arm.enable = slow
+    assert bench.ask(Verb.ARM) == ""
+    assert bench.tick(10) is State.ARMED
+
+
+def test_with_the_drives_off_a_late_loop_is_none_of_safetys_business(bench):
+    bench.reach(State.READY)
+    bench.clock.sleep_until(bench.clock.now_ns() + 10**9)
+    assert bench.tick() is State.READY
