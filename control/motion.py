@@ -8,8 +8,10 @@ import numpy as np
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
 from robotctl.control.reference import Reference
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample, Vector
+from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip, Shaper
 from robotctl.safety.torque import StoppableMotion
 from robotctl.safety.trip import Trip
@@ -24,6 +26,11 @@ class Motion:
     """Makes one command per tick. `wanted`, `clip` and `command` tell of the last one."""
 
     def __init__(self, robot: Robot, kinematics: Kinematics) -> None:
+        """Build everything that a motion needs.
+
+        Raises:
+            ConfigError: if the profile's home or rest is where the tool may not be.
+        """
         self.rest = np.zeros(robot.dof)
         """What is wanted of an arm that is to brake and stay."""
         self.reference = Reference(robot, kinematics)
@@ -36,6 +43,7 @@ class Motion:
         self._torque_limiter = TorqueLimiter(robot)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
+        _refuse_forbidden_poses(robot, kinematics)
         self._farthest = _FASTEST * robot.limits.velocity * robot.period_ns * 1e-9 + _NOISE
         """Way that a joint may have gone since the last sample (n,), rad; further, and the sample is not believed."""
 
@@ -95,3 +103,15 @@ class Motion:
         self.wanted, self.clip = self.rest, Clip.NONE
         self.command = Command(CommandMode.DAMP, position, self.rest, share * self._kinematics.gravity(position))
         return self.command
+
+
+def _refuse_forbidden_poses(robot: Robot, kinematics: Kinematics) -> None:
+    for key in ("home", "rest"):
+        tool = kinematics.tool(np.array(getattr(robot.profile, key)))
+        for region in regions(robot.profile, robot.profile.safety.sphere_margin):
+            room = region.room(tool)
+            if room < 0.0:
+                what = (
+                    f"{robot.source}: {key}: the tool would be {-1e3 * room:.0f} mm past the bound of {region.name!r}"
+                )
+                raise ConfigError(what, "change the pose or the region")
