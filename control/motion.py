@@ -8,8 +8,10 @@ import numpy as np
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
 from robotctl.control.reference import Reference
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample, Vector
+from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip, Shaper
 from robotctl.safety.torque import StoppableMotion
 from robotctl.safety.trip import Trip
@@ -19,6 +21,11 @@ class Motion:
     """Makes one command per tick. `wanted`, `clip` and `command` tell of the last one."""
 
     def __init__(self, robot: Robot, kinematics: Kinematics) -> None:
+        """Build everything that a motion needs.
+
+        Raises:
+            ConfigError: if the profile's home or rest is where the tool may not be.
+        """
         self.rest = np.zeros(robot.dof)
         """What is wanted of an arm that is to brake and stay."""
         self.reference = Reference(robot, kinematics)
@@ -32,6 +39,7 @@ class Motion:
         self._torque_limiter = TorqueLimiter(robot)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
+        _refuse_forbidden_poses(robot, kinematics)
 
     def begin(self, position: Vector) -> Command:
         """Return the command that holds a measured pose, and lead on from there."""
@@ -93,3 +101,15 @@ class Motion:
         self.wanted, self.clip = self.rest, Clip.NONE
         self.command = Command(CommandMode.DAMP, position, self.rest, share * self._kinematics.gravity(position))
         return self.command
+
+
+def _refuse_forbidden_poses(robot: Robot, kinematics: Kinematics) -> None:
+    for key in ("home", "rest"):
+        tool = kinematics.tool(np.array(getattr(robot.profile, key)))
+        for region in regions(robot.profile, robot.profile.safety.sphere_margin):
+            room = region.room(tool)
+            if room < 0.0:
+                what = (
+                    f"{robot.source}: {key}: the tool would be {-1e3 * room:.0f} mm past the bound of {region.name!r}"
+                )
+                raise ConfigError(what, "change the pose or the region")

@@ -127,13 +127,53 @@ class Sphere(_Strict):
     """m"""
 
 
+class KeepOutPlane(_Strict):
+    """A table, a wall, a floor: a plane that tool point and moving links stay on one side of, in the base frame."""
+
+    kind: Literal["plane"]
+    name: str
+    point: Point
+    """Any point of the plane, m."""
+    normal: Point
+    """Points to the side that is free; any length but zero."""
+    clearance: NotNegative = 0.0
+    """Distance that the tool point keeps from it, m."""
+
+    @model_validator(mode="after")
+    def _has_sides(self) -> "KeepOutPlane":
+        if not any(self.normal):
+            raise ValueError("normal: has no direction")
+        return self
+
+
+class KeepOutBox(_Strict):
+    """An obstacle: a box that tool point and moving links stay out of, in the base frame."""
+
+    kind: Literal["box"]
+    name: str
+    centre: Point
+    """m"""
+    half: tuple[Positive, Positive, Positive]
+    """Half of its sides, m."""
+    rpy: Point = (0.0, 0.0, 0.0)
+    """Its turn about the fixed axes x, then y, then z, rad."""
+    clearance: NotNegative = 0.0
+    """Distance that the tool point keeps from it, m."""
+
+
+KeepOut = Annotated[KeepOutPlane | KeepOutBox, Field(discriminator="kind")]
+
+
 class Safety(_Strict):
     """Thresholds of the protections. Every default is on."""
 
     sphere: Literal["qp", "projection"] = "qp"
     """How the sphere bounds a command: as a row of the QP, or by the projection rule of Gu et al. 2017."""
     sphere_gain: Positive = 5.0
-    """Largest approach speed per metre of distance left, 1/s. At most 1/(4 (lag + delay)) of the actuators."""
+    """Largest approach speed per metre of distance left, 1/s. At most 1/(4 (lag + delay)) of the actuators.
+
+    It holds for the sphere and every `keep_out` alike, as do the next two.
+    """
     sphere_margin: NotNegative = 0.002
     """Kept free inside the sphere, m; covers the tracking error."""
     sphere_breach: Positive = 0.010
@@ -250,6 +290,8 @@ class RobotProfile(_Strict):
     safety: Safety = Safety()
     can: CanBus | None = None
     twin: Twin = Twin()
+    keep_out: list[KeepOut] = []
+    """Planes and boxes where neither tool point nor moving links may be."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "RobotProfile":
@@ -266,6 +308,10 @@ class RobotProfile(_Strict):
         twice = {motor for motor in ids if ids.count(motor) > 1}
         if twice:
             raise ValueError(f"drive.id: {sorted(twice)} used by more than one motor")
+        names = ["sphere", *(item.name for item in self.keep_out)]
+        same = {name for name in names if names.count(name) > 1}
+        if same:
+            raise ValueError(f"keep_out: more than one region is called {sorted(same)}")
         if self.can and not self.can.fd and self.servo_hz > CLASSIC_HZ:
             raise ValueError(f"servo_hz: classic CAN carries at most {CLASSIC_HZ} Hz, not {self.servo_hz}")
         if self.can and any(joint.drive is None for joint in self.joints):

@@ -11,6 +11,7 @@ from robotctl.hal.document import read_document
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import CONFIGS, Robot
 from robotctl.hal.types import Vector
+from robotctl.safety.region import regions
 
 _ATTEMPTS = 1000
 
@@ -37,16 +38,16 @@ class ReachTask(BaseModel):
         """Return the target point (3,) of one episode, the same for the same seed.
 
         Raises:
-            ConfigError: if the robot's sphere leaves no room for the cube.
+            ConfigError: if the robot's sphere and keep-outs leave no room for the cube.
         """
         rng = np.random.default_rng((seed, episode))
         home = kinematics.tool(np.array(robot.profile.home))
-        centre = np.array(robot.profile.sphere.centre)
+        allowed = regions(robot.profile, self.success)
         for _ in range(_ATTEMPTS):
             goal: Vector = home + rng.uniform(-0.5 * self.cube, 0.5 * self.cube, 3)
-            if np.linalg.norm(goal - centre) < robot.profile.sphere.radius - self.success:
+            if all(region.room(goal) > 0.0 for region in allowed):
                 return goal
-        raise ConfigError(f"{robot.source}: the sphere leaves no room for the targets of task {self.name!r}")
+        raise ConfigError(f"{robot.source}: sphere and keep-outs leave no room for the targets of task {self.name!r}")
 
 
 def load_task(name: str) -> ReachTask:

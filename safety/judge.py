@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from robotctl.hal.robot import Robot
 from robotctl.safety.machine import ENABLED
+from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip
 
 POSITION_BOUND = 0.5e-3
 """rad past a soft limit"""
-SPHERE_BOUND = 2e-3
-"""m outside the sphere"""
+REGION_BOUND = 2e-3
+"""m outside the sphere, or inside a keep-out region"""
 
 
 class Judge:
@@ -26,11 +27,18 @@ class Judge:
         self._limits = robot.limits
         self._centre = np.array(robot.profile.sphere.centre)
         self._radius = robot.profile.sphere.radius
-        self._velocity_bound = robot.profile.safety.velocity_tolerance
         self._enabled = np.array(sorted(ENABLED))
-        self.violations = {"position": 0, "velocity": 0, "sphere": 0}
-        """Ticks beyond each bound."""
-        self.worst = {"position": -np.inf, "velocity": -np.inf, "sphere": -np.inf}
+        self._keep_outs = regions(robot.profile)[1:]
+        self._bounds = {
+            "position": POSITION_BOUND,
+            "velocity": robot.profile.safety.velocity_tolerance,
+            "sphere": REGION_BOUND,
+        }
+        if self._keep_outs:
+            self._bounds["keep_out"] = REGION_BOUND
+        self.violations = dict.fromkeys(self._bounds, 0)
+        """Ticks beyond each bound; "keep_out" counts where the profile has any."""
+        self.worst = dict.fromkeys(self._bounds, -np.inf)
         """Largest excess over each limit seen, rad, rad/s and m; negative while inside."""
         self.judged = 0
         self.on_truth = True
@@ -49,8 +57,10 @@ class Judge:
             "velocity": (np.abs(velocity) - self._limits.velocity).max(axis=1),
             "sphere": np.linalg.norm(tool - self._centre, axis=1) - self._radius,
         }
-        bounds = {"position": POSITION_BOUND, "velocity": self._velocity_bound, "sphere": SPHERE_BOUND}
+        if self._keep_outs:
+            rooms = [[region.room(point) for region in self._keep_outs] for point in tool]
+            excess["keep_out"] = -np.min(rooms, axis=1)
         for key, values in excess.items():
-            self.violations[key] += int((values > bounds[key]).sum())
+            self.violations[key] += int((values > self._bounds[key]).sum())
             self.worst[key] = max(self.worst[key], float(values.max()))
         self.judged += len(records)

@@ -5,12 +5,11 @@ its drives in `drives.py`, whether a measurement can be true in `believable.py`.
 `shaper.py`, those that judge targets in `admission.py`, and what leaves for the drives is judged by `guard.py`.
 """
 
-import math
-
 import numpy as np
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
+from robotctl.safety.region import regions
 from robotctl.safety.trip import Category, Protection, Trip
 
 
@@ -38,24 +37,25 @@ class PositionBreach:
 
 
 class SphereBreach:
-    """P5: the measured tool point is outside the sphere by more than the profile's `sphere_breach`."""
+    """P5: the measured tool point is past the bound of a region by more than the profile's `sphere_breach`."""
 
     def __init__(self, robot: Robot) -> None:
-        self._centre = np.array(robot.profile.sphere.centre)
-        self._radius = robot.profile.sphere.radius
+        self._regions = regions(robot.profile)
         self._breach = robot.profile.safety.sphere_breach
 
     def outside(self, tool: Vector) -> float:
-        """Return how far `tool` is outside the sphere, m; negative inside."""
-        offset = tool - self._centre
-        return math.sqrt(offset @ offset) - self._radius
+        """Return how far `tool` (3,) is outside the region it is furthest outside of, m; negative inside all."""
+        return self._worst(tool)[0]
 
     def check(self, tool: Vector, stamp_ns: int) -> Trip | None:
-        outside = self.outside(tool)
+        outside, name = self._worst(tool)
         if outside <= self._breach:
             return None
-        cause = f"tool measured {1e3 * outside:.0f} mm outside its sphere; acknowledge, then retreat"
+        cause = f"tool measured {1e3 * outside:.0f} mm past the bound of {name!r}; acknowledge, then retreat"
         return Trip(Protection.SPHERE, Category.BRAKE_HOLD, cause, stamp_ns)
+
+    def _worst(self, tool: Vector) -> tuple[float, str]:
+        return max((-region.room(tool), region.name) for region in self._regions)
 
 
 class FeedbackAge:

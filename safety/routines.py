@@ -14,7 +14,7 @@ import numpy as np
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
-from robotctl.safety.sphere import BoundingSphere
+from robotctl.safety.region import regions
 
 _GAIN = 3.0
 """Approach speed per rad of distance left, 1/s."""
@@ -57,7 +57,7 @@ class Settle(Routine):
 
 
 class Retreat(Routine):
-    """R1: back inside the joint limits and the sphere, slowly, straight along the gradient."""
+    """R1: back inside the joint limits and all regions, slowly, straight along the gradient."""
 
     name = "retreat"
     timeout_s = 30.0
@@ -68,18 +68,18 @@ class Retreat(Routine):
         self._upper = robot.limits.upper - margin
         self._cap = _RETREAT_SCALE * robot.limits.velocity
         self._geometry = geometry
-        self._sphere = BoundingSphere(robot.profile)
+        self._regions = regions(robot.profile, robot.profile.safety.sphere_margin)
 
     def velocity(self, sample: Sample, position: Vector) -> Vector | None:
         inside = np.minimum(np.maximum(position, self._lower), self._upper)
         wanted = _GAIN * (inside - position)
         tool, jacobian = self._geometry.tool_and_jacobian(position)
-        offset = tool - self._sphere.centre
-        distance = float(np.linalg.norm(offset))
-        outside = distance - self._sphere.radius + _RETREAT_DEPTH
-        if outside > 0.0:
-            damped = jacobian @ jacobian.T + 1e-3 * np.eye(3)
-            wanted = wanted - jacobian.T @ np.linalg.solve(damped, _GAIN * outside * offset / distance)
+        outside = _RETREAT_DEPTH - min(region.room(tool) for region in self._regions)
+        damped = jacobian @ jacobian.T + 1e-3 * np.eye(3)
+        for region in self._regions:
+            short, outward = _RETREAT_DEPTH - region.room(tool), region.outward(tool)
+            if short > 0.0 and outward is not None:
+                wanted = wanted - jacobian.T @ np.linalg.solve(damped, _GAIN * short * outward)
         if float(np.abs(inside - position).max()) < _ARRIVED and outside < 0.2 * _RETREAT_DEPTH:
             return None
         # At least a crawl, so that the end is reached.

@@ -5,9 +5,9 @@ acceleration: q' = q + dt (v + v')/2. Three things hold for the v' it returns:
 
 1. it lies in a box: velocity caps, acceleration caps, and per joint a bound from which braking at the acceleration
    cap ends at the soft limit;
-2. it is the velocity in that box closest to the wanted one that keeps the sphere's row (one QP, or the named
-   alternative `projection`);
-3. braking every joint at its cap from the next reference keeps the tool inside the sphere. Where a candidate fails
+2. it is the velocity in that box closest to the wanted one that keeps the row of every region (one QP; for the
+   sphere there is the named alternative `projection`);
+3. braking every joint at its cap from the next reference keeps the tool inside every region. Where a candidate fails
    that, the shaper brakes instead, which is the very motion that the previous step proved; so the claim carries
    over from step to step, whatever is asked for.
 """
@@ -20,7 +20,7 @@ import numpy as np
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
-from robotctl.safety.sphere import BoundingSphere, Row
+from robotctl.safety.region import Region, Row, regions
 
 _SOFT = 8
 """daqp's sense of a constraint that gives way, at a price, rather than make the problem infeasible."""
@@ -28,8 +28,10 @@ _SOLVED = (1, 2)
 """daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
 
 
-_SAMPLES = np.array([[1.0], [0.75], [0.5], [0.25]])
-"""Where along the time to rest a predicted stop is looked at; the end first, since it fails first."""
+_SAMPLES = np.array([[0.25], [0.5], [0.75], [1.0]])
+"""Where along the time to rest a predicted stop is looked at."""
+_ROUNDING = 1e-9
+"""m"""
 
 
 class ToolModel(Protocol):
@@ -55,6 +57,7 @@ class Clip(IntFlag):
     PREDICTED_STOP = 8
     RECOVERY = 16
     """Not a limit: the arm began outside its limits, and only a retreat may move it."""
+    KEEP_OUT = 32
 
 
 class Shaped(NamedTuple):
@@ -75,8 +78,11 @@ class Shaper:
         self._tool = model.tool
         self.velocity_cap = usable * limits.velocity
         self.acceleration_cap = usable * limits.acceleration
-        self.sphere = BoundingSphere(robot.profile)
+        self.regions = regions(robot.profile, safety.sphere_margin)
+        self._sphere = self.regions[0]
+        self._gain = safety.sphere_gain
         self._projects = safety.sphere == "projection"
+        self._rowed = self.regions[1:] if self._projects else self.regions
         self._n = robot.dof
         # Upper and mirrored lower bounds side by side: one vector operation serves both.
         margin = safety.position_margin
@@ -95,12 +101,11 @@ class Shaper:
         self._reach_step = model.reach * self._dt
         self._reach_braking = model.reach / (2.0 * self.acceleration_cap)
         self._hessian = np.eye(self._n)
-        # Where braking within the acceleration caps cannot keep the row, the row gives way, not the caps.
-        self._firm = np.zeros(self._n + 1, dtype=np.int32)
-        self._giving = self._firm.copy()
-        self._giving[-1] = _SOFT
-        self._bounds = np.empty((2, self._n + 1))
-        self._bounds[0, -1] = -1e30
+        firm = np.zeros(self._n + len(self.regions), dtype=np.int32)
+        # Where braking within the acceleration caps cannot keep the rows, the rows give way, not the caps.
+        giving = firm.copy()
+        giving[self._n :] = _SOFT
+        self._senses = (firm, giving)
 
     def step(self, position: Vector, velocity: Vector, wanted: Vector, tool: Vector, jacobian: Vector) -> Shaped:
         """Return the reference velocity of the next step.
@@ -118,16 +123,14 @@ class Shaper:
             best = wanted
         else:
             clip = Clip.POSITION if (np.abs(wanted) <= self.velocity_cap).all() else Clip.VELOCITY
+        rooms = [(region.room(tool), region) for region in self.regions]
+        if self._gain * min(room for room, _ in rooms) < np.abs(best) @ self._reach:
+            best, touched = self._into_regions(best, wanted, lower, upper, tool, jacobian)
+            clip |= touched
         speed = np.abs(best)
-        room = self.sphere.room(tool)
-        if self.sphere.gain * room < speed @ self._reach:
-            row = self.sphere.row(tool, jacobian)
-            if row is not None and float(row.normal @ best) > row.bound:
-                clip |= Clip.SPHERE
-                best = self._into_sphere(best, wanted, lower, upper, row, tool, jacobian)
-                speed = np.abs(best)
         way = speed @ (self._reach_step + self._reach_braking * speed)
-        if room < way and not self._stops_inside(position, velocity, best, tool):
+        near = [(room, region) for room, region in rooms if room < way]
+        if near and not self._stops_inside(position, velocity, best, tool, near):
             clip |= Clip.PREDICTED_STOP
             best = self.brake(velocity)
         return Shaped(best, clip)
@@ -156,26 +159,46 @@ class Shaper:
         root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * room) - self._half_step2
         return np.minimum(root, self._cap2)
 
-    def _into_sphere(
-        self, best: Vector, wanted: Vector, lower: Vector, upper: Vector, row: Row, tool: Vector, jacobian: Vector
-    ) -> Vector:
+    def _into_regions(
+        self, best: Vector, wanted: Vector, lower: Vector, upper: Vector, tool: Vector, jacobian: Vector
+    ) -> Shaped:
+        """Return the velocity in the box closest to the wanted one that keeps all rows, `best` if that does."""
+        clip = Clip.NONE
         if self._projects:
-            projected = self.sphere.project(best, tool, jacobian, self._dt)
-            scale = float((np.abs(projected) / self.velocity_cap).max())
-            return np.minimum(np.maximum(projected / max(1.0, scale), lower), upper)
-        bounds = self._bounds
-        bounds[0, :-1] = lower
-        bounds[1, :-1] = upper
-        bounds[1, -1] = row.bound
-        for sense in (self._firm, self._giving):
-            solution, _, flag, _ = daqp.solve(
-                self._hessian, -wanted, row.normal[np.newaxis], bounds[1], bounds[0], sense
-            )
+            projected = self._sphere.project(best, tool, jacobian, self._dt)
+            if projected is not best:
+                clip = Clip.SPHERE
+                scale = float((np.abs(projected) / self.velocity_cap).max())
+                wanted = best = np.minimum(np.maximum(projected / max(1.0, scale), lower), upper)
+        rows = []
+        breaks = False
+        for region in self._rowed:
+            row = region.row(tool, jacobian)
+            if row is not None:
+                rows.append(row)
+                if float(row.normal @ best) > row.bound:
+                    breaks = True
+                    clip |= Clip.SPHERE if region is self._sphere else Clip.KEEP_OUT
+        return Shaped(self._solve(wanted, lower, upper, rows) if breaks else best, clip)
+
+    def _solve(self, wanted: Vector, lower: Vector, upper: Vector, rows: list[Row]) -> Vector:
+        normals = np.array([row.normal for row in rows])
+        most = np.concatenate([upper, [row.bound for row in rows]])
+        least = np.concatenate([lower, np.full(len(rows), -1e30)])
+        for sense in self._senses:
+            solution, _, flag, _ = daqp.solve(self._hessian, -wanted, normals, most, least, sense[: len(most)])
             if flag in _SOLVED:
                 return np.asarray(np.minimum(np.maximum(solution, lower), upper))
         return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
 
-    def _stops_inside(self, position: Vector, velocity: Vector, following: Vector, tool: Vector) -> bool:
+    def _stops_inside(
+        self,
+        position: Vector,
+        velocity: Vector,
+        following: Vector,
+        tool: Vector,
+        near: list[tuple[float, Region]],
+    ) -> bool:
         """Return whether the tool stays inside while every joint brakes at its cap from `following`.
 
         The joints do not come to rest together, so the way is sampled in time, not between its ends. Already
@@ -184,8 +207,6 @@ class Shaper:
         start = position + (0.5 * self._dt) * (velocity + following)
         rest = np.maximum(np.abs(following) / self.acceleration_cap, 1e-9)
         times = np.minimum(_SAMPLES * rest.max(), rest)
-        allowed = min(0.0, self.sphere.room(tool))
-        for braking in following * times * (1.0 - 0.5 * times / rest):
-            if self.sphere.room(self._tool(start + braking)) < allowed:
-                return False
-        return True
+        poses = start + following * times * (1.0 - 0.5 * times / rest)
+        path = np.array([tool, *(self._tool(pose) for pose in poses)])
+        return all(region.along(path) >= min(0.0, room) - _ROUNDING for room, region in near)

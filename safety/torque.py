@@ -4,8 +4,8 @@ import numpy as np
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample
+from robotctl.safety.region import regions
 from robotctl.safety.shaper import ToolModel
-from robotctl.safety.sphere import BoundingSphere
 from robotctl.safety.trip import Category, Protection, Trip
 
 _BRAKE_SHARE = 0.5
@@ -14,13 +14,13 @@ _REACTION_S = 0.01
 
 
 class StoppableMotion:
-    """Braking from the measured state has to end inside joint limits, velocity caps and sphere; else category 2."""
+    """Braking from the measured state has to end inside joint limits, velocity caps and regions; else category 2."""
 
     def __init__(self, robot: Robot, model: ToolModel) -> None:
         self._names = [joint.name for joint in robot.profile.joints]
         self._limits = robot.limits
         self._deceleration = _BRAKE_SHARE * robot.limits.acceleration
-        self._sphere = BoundingSphere(robot.profile)
+        self._regions = regions(robot.profile, robot.profile.safety.sphere_margin)
         self._tool = model.tool
 
     def check(self, sample: Sample) -> Trip | None:
@@ -35,8 +35,10 @@ class StoppableMotion:
         joint = int(fast.argmax())
         if not fast[joint] <= 0.0:
             return self._trip(f"{self._names[joint]} moves at {speed[joint]:.2f} rad/s, over its cap", sample)
-        if min(self._sphere.room(self._tool(stop)), self._sphere.room(self._tool(sample.position + 0.5 * ahead))) < 0.0:
-            return self._trip("the tool would stop outside its sphere", sample)
+        path = np.array([self._tool(sample.position + share * ahead) for share in (0.0, 0.5, 1.0)])
+        for region in self._regions:
+            if region.along(path) < 0.0:
+                return self._trip(f"the tool would stop past the bound of {region.name!r}", sample)
         return None
 
     def _trip(self, what: str, sample: Sample) -> Trip:

@@ -60,6 +60,22 @@ def test_arrays_are_read_only(panda: Robot) -> None:
         ("name: panda_joint1", "name: panda_elbow", r"'panda_elbow' is not in the model"),
         ("home: [0.0,", "home: [9.0,", r"outside its limits"),
         ("home: [0.0, -0.4,", "home: [0.0,", r"6 values for 7 joints"),
+        (
+            "brakes: true",
+            "brakes: true\nkeep_out: [{kind: plane, name: a, point: [0, 0, 0], normal: [0, 0, 0]}]",
+            r"keep_out.0.plane: normal: has no direction",
+        ),
+        (
+            "brakes: true",
+            "brakes: true\nkeep_out: [{kind: box, name: a, centre: [0, 0, 0], half: [1, 0, 1]}]",
+            r"keep_out.0.box.half.1: .*greater than 0",
+        ),
+        (
+            "brakes: true",
+            "brakes: true\nkeep_out: [{kind: plane, name: sphere, point: [0, 0, 0], normal: [0, 0, 1]}]",
+            r"keep_out: more than one region is called \['sphere'\]",
+        ),
+        ("brakes: true", "brakes: true\nkeep_out: [{kind: cone, name: a}]", r"keep_out.0: .*'cone'"),
         ("title:", "title", r"panda.yaml:\d+: not valid YAML"),
         ("title: Franka Emika Panda (7 joints; CAN drives emulated only)\n", "", r"title: missing"),
     ],

@@ -5,7 +5,7 @@ import pytest
 
 from robotctl.control.shared import tick_dtype
 from robotctl.hal.robot import load_robot
-from robotctl.safety.judge import POSITION_BOUND, SPHERE_BOUND, Judge
+from robotctl.safety.judge import POSITION_BOUND, REGION_BOUND, Judge
 from robotctl.safety.machine import ENABLED, State
 from robotctl.safety.shaper import Clip
 
@@ -34,7 +34,7 @@ def plant(records, index, key, excess, prefix="true_"):
         records[prefix + "tool"][index] = CENTRE + np.array([0.0, RADIUS + excess, 0.0])
 
 
-BOUNDS = {"position": POSITION_BOUND, "velocity": ROBOT.profile.safety.velocity_tolerance, "sphere": SPHERE_BOUND}
+BOUNDS = {"position": POSITION_BOUND, "velocity": ROBOT.profile.safety.velocity_tolerance, "sphere": REGION_BOUND}
 
 
 def test_a_clean_run_has_none():
@@ -59,6 +59,17 @@ def test_each_planted_violation_is_counted_once(key):
     judge.take(records[8:])
     assert judge.violations == {"position": 0, "velocity": 0, "sphere": 0} | {key: 4}
     assert judge.worst[key] == pytest.approx(BOUNDS[key] + 1e-6)
+
+
+def test_keep_outs_count_where_there_are_any():
+    table = "keep_out=[{kind: plane, name: table, point: [0, 0, 0.3], normal: [0, 0, 1], clearance: 0.01}]"
+    judge = Judge(load_robot("panda", [table]))
+    records = clean(4)
+    for index, excess in ((1, REGION_BOUND + 1e-6), (2, REGION_BOUND - 1e-6)):
+        records["true_tool"][index] = CENTRE * [1, 1, 0] + [0.0, 0.0, 0.31 - excess]
+    judge.take(records)
+    assert judge.violations == {"position": 0, "velocity": 0, "sphere": 0, "keep_out": 1}
+    assert judge.worst["keep_out"] == pytest.approx(REGION_BOUND + 1e-6)
 
 
 def test_lower_limits_count_like_upper_ones():

@@ -62,7 +62,20 @@ def test_sphere(robot: Robot, direction, step):
     assert (trip is not None) is (step > 0)
     if trip is not None:
         assert (trip.protection, trip.category, trip.onset_ns) == (Protection.SPHERE, Category.BRAKE_HOLD, STAMP)
-        assert f"{1e3 * (robot.profile.safety.sphere_breach + step):.0f} mm outside" in trip.cause
+        assert f"{1e3 * (robot.profile.safety.sphere_breach + step):.0f} mm past the bound of 'sphere'" in trip.cause
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_keep_outs_are_breached_like_the_sphere(step):
+    robot = load_robot("panda", ["keep_out=[{kind: plane, name: table, point: [0, 0, 0.3], normal: [0, 0, 1]}]"])
+    check = SphereBreach(robot)
+    tool = np.array([0.45, 0.0, 0.3 - robot.profile.safety.sphere_breach - step])
+    assert check.outside(tool) == pytest.approx(robot.profile.safety.sphere_breach + step)
+    trip = check.check(tool, STAMP)
+    assert (trip is not None) is (step > 0)
+    if trip is not None:
+        assert (trip.protection, trip.category, trip.onset_ns) == (Protection.SPHERE, Category.BRAKE_HOLD, STAMP)
+        assert f"{1e3 * (robot.profile.safety.sphere_breach + step):.0f} mm past the bound of 'table'" in trip.cause
 
 
 def test_the_spheres_breach_is_measured_from_the_full_radius_not_from_the_shapers(panda: Robot):

@@ -7,9 +7,9 @@ from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import VelocityLimiter
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Sample
+from robotctl.safety.region import regions
 from robotctl.safety.routines import Goto, Retreat, Settle
 from robotctl.safety.shaper import Shaper
-from robotctl.safety.sphere import BoundingSphere
 
 
 def sample(position, velocity=None):
@@ -109,7 +109,7 @@ def test_retreat_from_beyond_joint_limits(robot: Robot, kinematics: Kinematics):
         start[0] = limit[0] + side * 0.1
         start[-1] = limit[-1] + side * 0.05
         routine = Retreat(robot, kinematics)
-        routine._sphere.radius = 10.0  # the joints alone
+        routine._regions[0].radius = 10.0  # the joints alone
         positions, wishes = lead_ideally(robot, routine, start)
         beyond = np.maximum(positions - robot.limits.upper, robot.limits.lower - positions).max(axis=1)
         assert beyond[0] > 0.0
@@ -121,7 +121,7 @@ def test_retreat_from_beyond_joint_limits(robot: Robot, kinematics: Kinematics):
 def test_retreat_from_outside_the_sphere(robot: Robot, kinematics: Kinematics):
     """Several starts up to 6 cm outside: always inwards, slowly, and to its end."""
     rng = np.random.default_rng(2)
-    sphere = BoundingSphere(robot.profile)
+    sphere = regions(robot.profile, robot.profile.safety.sphere_margin)[0]
     starts = []
     while len(starts) < 3:
         pose = rng.uniform(robot.limits.lower + 0.2, robot.limits.upper - 0.2)
@@ -136,6 +136,27 @@ def test_retreat_from_outside_the_sphere(robot: Robot, kinematics: Kinematics):
         assert (positions >= robot.limits.lower).all()
         assert (positions <= robot.limits.upper).all()
         assert (np.abs(velocities) <= robot.limits.velocity).all()
+
+
+@pytest.mark.parametrize("kind", ["plane", "box"])
+def test_retreat_from_inside_a_keep_out(panda: Robot, kind: str):
+    """Home lies 3 cm inside; the way out is the shortest, and at least 1 cm further."""
+    home = np.array(panda.profile.home)
+    x, y, z = Kinematics(panda).tool(home)
+    item = {
+        "plane": f"{{kind: plane, name: a, point: [{x - 0.03}, 0, 0], normal: [-1, 0, 0]}}",
+        "box": f"{{kind: box, name: a, centre: [{x + 0.07}, {y}, {z}], half: [0.1, 0.3, 0.3]}}",
+    }[kind]
+    robot = load_robot("panda", [f"keep_out=[{item}]"])
+    kinematics = Kinematics(robot)
+    region = regions(robot.profile)[1]
+    positions, _, wishes = lead(robot, kinematics, Retreat(robot, kinematics), home)
+    rooms = np.array([region.room(kinematics.tool(position)) for position in positions])
+    assert rooms[0] == pytest.approx(-0.03)
+    assert rooms[-1] > 0.01
+    assert (np.diff(rooms) >= -1e-6).all()
+    assert kinematics.tool(positions[-1])[1:] == pytest.approx([y, z], abs=5e-3)
+    assert (np.abs(wishes) <= 0.1 * robot.limits.velocity * (1 + 1e-9)).all()
 
 
 def test_retreat_through_the_shaper_from_beyond_a_joint_limit(panda: Robot):

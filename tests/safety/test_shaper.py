@@ -6,50 +6,117 @@ import pytest
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import VelocityLimiter
 from robotctl.hal.robot import Robot, load_robot
+from robotctl.safety.region import Row, regions
 from robotctl.safety.shaper import Clip, Shaper
 
 STATES = 2000
 
 
+def keep_outs(robot: Robot) -> str:
+    """The setting for a table under home, and a turned box beside it."""
+    home = Kinematics(robot).tool(np.array(robot.profile.home))
+    box = [round(float(value), 4) for value in home + np.array([0.02, 0.13, 0.0])]
+    table = f"{{kind: plane, name: table, point: [0, 0, {home[2] - 0.06:.4f}], normal: [0, 0, 1]}}"
+    post = f"{{kind: box, name: post, centre: {box}, half: [0.05, 0.06, 0.2], rpy: [0.2, 0, 0.7], clearance: 0.01}}"
+    return f"keep_out=[{table}, {post}]"
+
+
+def without_acceleration_caps(robot: Robot) -> list[str]:
+    """Settings with which one step has to reach its answer at once."""
+    return [f"joints.{joint}.acceleration=1e9" for joint in range(robot.dof)]
+
+
 def near_the_surface(robot: Robot, kinematics: Kinematics, count: int) -> list[np.ndarray]:
     """Random poses whose tool lies within 2 cm of the sphere's surface, inside."""
     rng = np.random.default_rng(3)
-    centre, radius = np.array(robot.profile.sphere.centre), robot.profile.sphere.radius
-    margin = robot.profile.safety.sphere_margin
+    sphere = regions(robot.profile, robot.profile.safety.sphere_margin)[0]
     poses: list[np.ndarray] = []
     while len(poses) < count:
         pose = rng.uniform(robot.limits.lower + 0.1, robot.limits.upper - 0.1)
-        if 0.0 < radius - margin - np.linalg.norm(kinematics.tool(pose) - centre) < 0.02:
+        if 0.0 < sphere.room(kinematics.tool(pose)) < 0.02:
             poses.append(pose)
     return poses
 
 
-def test_random_states_at_the_surface_and_twice_the_cap(panda: Robot) -> None:
-    """Projecting and clamping one after the other lets a quarter of these through; the QP none."""
-    kinematics = Kinematics(panda)
-    shaper = Shaper(panda, kinematics)
-    # Without acceleration caps in the way, the step has to reach its answer at once.
-    shaper._change = np.full(panda.dof, 1e9)
-    rng = np.random.default_rng(4)
-    centre = np.array(panda.profile.sphere.centre)
-    for pose in near_the_surface(panda, kinematics, STATES):
+def closest(wanted: np.ndarray, lower: np.ndarray, upper: np.ndarray, rows: list[Row]) -> np.ndarray:
+    """The same QP by other means: at its optimum v = clip(wanted - sum of price * normal), price >= 0, one per row.
+
+    Each price in turn is found by bisection, until none changes any more (coordinate ascent on the dual).
+    """
+    prices = np.zeros(len(rows))
+    normals = np.array([row.normal for row in rows])
+    for _ in range(200):
+        before = prices.copy()
+        for index, row in enumerate(rows):
+
+            def outward(price: float, index: int = index, row: Row = row) -> float:
+                prices[index] = price
+                return float(row.normal @ np.clip(wanted - prices @ normals, lower, upper)) - row.bound
+
+            low, high = 0.0, 1.0
+            while outward(high) > 0.0 and high < 1e9:
+                high *= 2.0
+            for _ in range(100):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if outward(middle) > 0.0 else (low, middle)
+            prices[index] = 0.0 if outward(0.0) <= 0.0 else high
+        if np.abs(prices - before).max() < 1e-9 * max(1.0, prices.max()):
+            break
+    return np.clip(wanted - prices @ normals, lower, upper)
+
+
+def test_random_states_at_the_surface_and_twice_the_cap(robot: Robot) -> None:
+    """Projecting and clamping one after the other lets a quarter of these through; the QP none, and nearest of all."""
+    robot = load_robot(robot.profile.name, without_acceleration_caps(robot))
+    kinematics = Kinematics(robot)
+    shaper = Shaper(robot, kinematics)
+    sphere = shaper.regions[0]
+    rng, rest = np.random.default_rng(4), np.zeros(robot.dof)
+    bound, braked = 0, 0
+    for pose in near_the_surface(robot, kinematics, STATES):
         tool, jacobian = kinematics.tool_and_jacobian(pose)
-        wanted = rng.uniform(-2.0, 2.0, panda.dof) * panda.limits.velocity
-        rest = np.zeros(panda.dof)
-        lower, upper = shaper._box(pose, rest)
-        row = shaper.sphere.row(tool, jacobian)
-        assert row is not None
-        best = np.minimum(np.maximum(wanted, lower), upper)
-        if row.normal @ best > row.bound:
-            best = shaper._into_sphere(best, wanted, lower, upper, row, tool, jacobian)
-        assert (np.abs(best) <= panda.limits.velocity).all()
-        normal = (tool - centre) / np.linalg.norm(tool - centre)
-        assert normal @ jacobian @ best <= row.bound + 1e-6
-        # No other velocity that keeps the limits is closer: scaling the clipped one, the named fallback, is not.
-        clipped = np.minimum(np.maximum(wanted, lower), upper)
-        outward = float(row.normal @ clipped)
-        scaled = clipped * (1.0 if outward <= row.bound else row.bound / outward)
-        assert np.linalg.norm(best - wanted) <= np.linalg.norm(scaled - wanted) + 1e-6
+        wanted = rng.uniform(-2.0, 2.0, robot.dof) * robot.limits.velocity
+        best, clip = shaper.step(pose, rest, wanted, tool, jacobian)
+        row = sphere.row(tool, jacobian)
+        assert (np.abs(best) <= robot.limits.velocity).all()
+        assert row.normal @ best <= row.bound + 1e-7
+        if clip & Clip.PREDICTED_STOP:  # a step along the surface would leave it: some micrometres of room
+            braked += 1
+            assert sphere.room(tool) < 1e-5
+            continue
+        reference = closest(wanted, *shaper._box(pose, rest), [row])
+        assert np.linalg.norm(best - wanted) <= np.linalg.norm(reference - wanted) + 1e-6
+        bound += bool(clip & Clip.SPHERE)
+    assert bound > 0.2 * STATES
+    assert braked < 0.01 * STATES
+
+
+def test_random_states_between_a_table_and_a_box(robot: Robot) -> None:
+    """Several rows at once: the nearest velocity that keeps all of them."""
+    robot = load_robot(robot.profile.name, [keep_outs(robot), *without_acceleration_caps(robot)])
+    kinematics = Kinematics(robot)
+    shaper = Shaper(robot, kinematics)
+    rng, rest, home = np.random.default_rng(6), np.zeros(robot.dof), np.array(robot.profile.home)
+    states = several = 0
+    while states < 150:
+        pose = np.clip(home + rng.uniform(-0.8, 0.8, robot.dof), robot.limits.lower + 0.1, robot.limits.upper - 0.1)
+        tool, jacobian = kinematics.tool_and_jacobian(pose)
+        rooms = sorted(region.room(tool) for region in shaper.regions)
+        if rooms[0] < 1e-3 or rooms[1] > 0.05:  # near two of them, inside all
+            continue
+        states += 1
+        wanted = rng.uniform(-2.0, 2.0, robot.dof) * robot.limits.velocity
+        best, clip = shaper.step(pose, rest, wanted, tool, jacobian)
+        assert not clip & Clip.PREDICTED_STOP
+        rows = [region.row(tool, jacobian) for region in shaper.regions]
+        reference = closest(wanted, *shaper._box(pose, rest), rows)
+        assert all(row.normal @ best <= row.bound + 1e-7 for row in rows)
+        assert best == pytest.approx(reference, abs=1e-5)
+        several += sum(row.normal @ best > row.bound - 1e-7 for row in rows) > 1
+        assert bool(clip & Clip.KEEP_OUT) is any(
+            row.normal @ np.clip(wanted, *shaper._box(pose, rest)) > row.bound for row in rows[1:]
+        )
+    assert several > 5
 
 
 def test_the_projection_rule_is_wrong_where_it_is_said_to_be(panda: Robot) -> None:
@@ -71,7 +138,7 @@ def test_grid_around_each_soft_limit(panda: Robot, joint: int, side: float) -> N
     """From any state that could still brake, one step later it still can."""
     kinematics = Kinematics(panda)
     shaper = Shaper(panda, kinematics)
-    shaper.sphere.radius = 1e3
+    shaper.regions[0].radius = 1e3
     cap, brake = shaper.velocity_cap[joint], shaper.acceleration_cap[joint]
     margin, dt = panda.profile.safety.position_margin, panda.period_ns * 1e-9
     edge = (panda.limits.upper if side > 0 else -panda.limits.lower)[joint] - margin
@@ -100,17 +167,18 @@ def test_a_wish_inside_all_limits_is_granted_untouched(panda: Robot) -> None:
 
 
 @pytest.mark.parametrize("policy", ["random", "outward", "bang"])
-@pytest.mark.parametrize("sphere", ["qp", "projection"])
-def test_hostile_wishes_keep_every_invariant(robot: Robot, policy: str, sphere: str) -> None:
-    robot = load_robot(robot.profile.name, [f"safety.sphere={sphere}"])
+@pytest.mark.parametrize(("sphere", "furnished"), [("qp", False), ("projection", False), ("qp", True)])
+def test_hostile_wishes_keep_every_invariant(robot: Robot, policy: str, sphere: str, furnished: bool) -> None:
+    settings = [keep_outs(robot)] if furnished else []
+    robot = load_robot(robot.profile.name, [f"safety.sphere={sphere}", *settings])
     kinematics = Kinematics(robot)
     limiter, shaper, limits = VelocityLimiter(robot), Shaper(robot, kinematics), robot.limits
     rng = np.random.default_rng(11)
-    centre, radius, dt = np.array(robot.profile.sphere.centre), robot.profile.sphere.radius, robot.period_ns * 1e-9
+    full, centre, dt = regions(robot.profile), np.array(robot.profile.sphere.centre), robot.period_ns * 1e-9
     position, velocity, acceleration = np.array(robot.profile.home), np.zeros(robot.dof), np.zeros(robot.dof)
     wish = np.zeros(robot.dof)
     clipped = Clip.NONE
-    for tick in range(8000):
+    for tick in range(4000):
         tool, jacobian = kinematics.tool_and_jacobian(position)
         if tick % (25 if policy != "bang" else 250) == 0:
             if policy == "random":
@@ -130,22 +198,33 @@ def test_hostile_wishes_keep_every_invariant(robot: Robot, policy: str, sphere: 
         assert (position >= limits.lower).all()
         assert (np.abs(velocity) <= limits.velocity).all()
         assert (np.abs(acceleration) <= limits.acceleration).all()
-        assert np.linalg.norm(kinematics.tool(position) - centre) <= radius
-    assert Clip.SPHERE in clipped  # else nothing was tested
+        assert all(region.room(kinematics.tool(position)) >= 0.0 for region in full)
+    # Something came near a bound, else nothing was tested; the projection rule leaves most to the predicted stop.
+    expected = Clip.PREDICTED_STOP if sphere == "projection" else Clip.KEEP_OUT if furnished else Clip.SPHERE
+    assert expected in clipped
 
 
-def test_a_tool_outside_is_led_back(panda: Robot) -> None:
-    kinematics = Kinematics(panda)
-    shaper = Shaper(panda, kinematics)
+@pytest.mark.parametrize("kind", ["sphere", "plane", "box"])
+def test_a_tool_outside_is_led_back(panda: Robot, kind: str) -> None:
     home = np.array(panda.profile.home)
-    shaper.sphere.centre = kinematics.tool(home) - np.array([0.0, 0.0, shaper.sphere.radius + 0.02])
-    position, velocity, dt = home.copy(), np.zeros(7), panda.period_ns * 1e-9
+    x, y, z = Kinematics(panda).tool(home)
+    wall = x - 0.02 + panda.profile.safety.sphere_margin  # home lies 2 cm behind it
+    setting = {
+        "sphere": f"sphere.centre=[{x}, {y}, {z - panda.profile.sphere.radius - 0.018}]",
+        "plane": f"keep_out=[{{kind: plane, name: a, point: [{wall}, 0, 0], normal: [-1, 0, 0]}}]",
+        "box": f"keep_out=[{{kind: box, name: a, centre: [{wall + 0.1}, {y}, {z}], half: [0.1, 0.3, 0.3]}}]",
+    }[kind]
+    robot = load_robot("panda", [setting])
+    kinematics = Kinematics(robot)
+    shaper = Shaper(robot, kinematics)
+    region = shaper.regions[-1]
+    position, velocity, dt = home.copy(), np.zeros(7), robot.period_ns * 1e-9
     rooms = []
     for _ in range(500):
         tool, jacobian = kinematics.tool_and_jacobian(position)
         following = shaper.step(position, velocity, np.zeros(7), tool, jacobian).velocity
         position, velocity = position + 0.5 * dt * (velocity + following), following
-        rooms.append(shaper.sphere.room(tool))
-    assert rooms[0] < -0.019
+        rooms.append(region.room(tool))
+    assert rooms[0] == pytest.approx(-0.02)
     assert rooms[-1] > -0.005
     assert min(np.diff(rooms)) > -1e-6

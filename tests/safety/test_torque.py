@@ -94,4 +94,4 @@ def test_the_predicted_stop_of_the_tool_counts(panda: Robot):
         trip = check.check(sample(home, velocity))
         assert (trip is not None) is trips
         if trip is not None:
-            assert "tool would stop outside its sphere" in trip.cause
+            assert "tool would stop past the bound of 'sphere'" in trip.cause
