@@ -1,9 +1,10 @@
 """`robotctl emulate`: serve a robot's emulated drives to other programs."""
 
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Annotated
 
+import can
 import typer
 from rich.console import Console
 from rich.table import Table
@@ -40,6 +41,9 @@ def emulate(
     trouble: Annotated[list[str] | None, typer.Option(help=f"What goes wrong; repeatable. {TROUBLE_FORM}.")] = None,
     register: Annotated[list[str] | None, typer.Option(help=f"Preset; repeatable. {REGISTER_FORM}.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of noise and trouble.")] = 0,
+    log: Annotated[
+        Path | None, typer.Option(help="Write every frame here; the ending says how, as candump does in .log.")
+    ] = None,
     json: Annotated[
         Path | None, typer.Option(help="Write channel and motors at the start, counters at the end.")
     ] = None,
@@ -49,7 +53,8 @@ def emulate(
     with readable_errors():
         clock = MonotonicClock()
         loaded = load_robot(robot)
-        with closing(open_port(channel, loaded, adapters)) as port:
+        with ExitStack() as stack:
+            port = stack.enter_context(closing(open_port(channel, loaded, adapters)))
             # As they leave the factory, drives answer in classic CAN, which every host hears; CAN FD is a setting.
             if fd and not port.fd:
                 raise ConfigError(f"no CAN FD passes on {port.name}", "drop --fd, or serve on an interface with mtu 72")
@@ -60,6 +65,10 @@ def emulate(
                 order_trouble(bench, order)
             server = Server(bench, port, clock)
             server.on_status = _tell
+            if log is not None:
+                writer = _open_log(log)
+                stack.callback(writer.stop)
+                server.on_frame = writer.on_message_received
             _announce(bench, port)
             _write(json, robot, bench, port, server)
             end = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
@@ -71,6 +80,15 @@ def emulate(
             _write(json, robot, bench, port, server)
     if interrupted:
         raise typer.Exit(Exit.INTERRUPTED)
+
+
+def _open_log(path: Path) -> can.Listener:
+    try:
+        return can.Logger(path)
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"cannot log to {path}: {error}", "use a file that ends in .log, .asc, .blf or .csv"
+        ) from None
 
 
 def _tell(drive: DamiaoDrive, before: int, silent_s: float) -> None:

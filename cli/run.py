@@ -17,9 +17,9 @@ from robotctl.cli.keys import stop_keys
 from robotctl.cli.output import write_json
 from robotctl.control.loop import Verb
 from robotctl.control.process_session import ProcessSession
-from robotctl.control.recording_session import record_session
+from robotctl.control.recording_session import SessionRecording, record_session
 from robotctl.control.session import LockstepSession, Session
-from robotctl.hal.errors import ConfigError
+from robotctl.hal.errors import ConfigError, HardwareError
 from robotctl.hal.profile import CLASSIC_HZ
 from robotctl.hal.robot import load_robot
 from robotctl.learning.actor import Actor, InlineActor, ProcessActor
@@ -78,12 +78,14 @@ def run(
         )
         job = Job(session, actor, work, episodes, seed, path, about, overrides)
         try:
-            status, result = _carry_out(job, console)
+            status, result, lost = _carry_out(job, console)
         except Terminated:  # before anything moved, or after everything had come to rest
             raise typer.Exit(Exit.STOPPED_BY_SAFETY) from None
         _summarise(console, result)
         if json is not None:
             write_json(json, result)
+        if lost is not None:
+            raise lost
     if status is not Exit.DONE:
         raise typer.Exit(status)
 
@@ -102,39 +104,53 @@ class Job:
     overrides: list[str]
 
 
-def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any]]:
-    """Run a job to its end, or to wherever a person or a signal ends it."""
+def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any], HardwareError | None]:
+    """Run a job to its end, or to wherever a person, a signal or the loss of the hardware ends it."""
+
+    def on_trip(event: dict[str, Any]) -> None:
+        console.print(f"  [bold red]stop[/] {event['protection']} (category {event['stop_category']})", end=": ")
+        console.print(event["text"], markup=False)
+
+    session, outcome, recording = job.session, Outcome(), SessionRecording(job.path)
+    lost: HardwareError | None = None
+    recorded = record_session(session, job.path, job.about, on_trip, job.overrides)
+    try:
+        with _terminable(), session, recorded as recording, job.actor as actor:
+            recording.processes["policy"] = actor.pid
+            with _stopped_by_errors(session), stop_keys(session.emergency_stop):
+                status = _attempt(job, outcome, console)
+            state = session.state.name
+    except HardwareError as error:
+        status, lost, state = Exit.NO_HARDWARE, error, session.state.name
+    result = report(session, outcome, job.about, recording)
+    result["safety"]["state"] = state
+    result["processes"] = recording.processes
+    result["error"] = lost.what if lost is not None else ""
+    return status, result, lost
+
+
+def _attempt(job: Job, outcome: Outcome, console: Console) -> Exit:
+    """Run the episodes until they are done, or safety, a person or a signal ends them; the arm is at rest then."""
 
     def on_episode(index: int, episode: Episode) -> None:
         mark = "[green]reached[/]" if episode.success else "[yellow]missed[/] "
         distance = f"{1e3 * episode.final_distance_m:7.1f} mm"
         console.print(f"  episode {index + 1}  {mark}  {distance}  {episode.steps:4d} steps")
 
-    def on_trip(event: dict[str, Any]) -> None:
-        console.print(f"  [bold red]stop[/] {event['protection']} (category {event['stop_category']})", end=": ")
-        console.print(event["text"], markup=False)
-
-    session, outcome, status = job.session, Outcome(), Exit.DONE
-    recorded = record_session(session, job.path, job.about, on_trip, job.overrides)
-    with _terminable(), session, recorded as recording, job.actor as actor:
-        with _stopped_by_errors(session), stop_keys(session.emergency_stop):
-            try:
-                try:
-                    run_episodes(session, actor, job.task, job.episodes, job.seed, outcome, on_episode)
-                    status = Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
-                except KeyboardInterrupt:
-                    status, outcome.stopped = Exit.INTERRUPTED, "interrupted"
-                    console.print("  interrupted: braking, then drives off; Ctrl-C again for drives off at once")
-                    _wind_down(session)
-            except Terminated:
-                status, outcome.stopped = Exit.STOPPED_BY_SAFETY, "emergency stop by SIGTERM"
-                console.print(f"  {outcome.stopped}")
-                session.bring_to_rest(Verb.ESTOP)
-        state = session.state.name
-    result = report(session, outcome, job.about, recording)
-    result["safety"]["state"] = state
-    result["processes"] = recording.processes | {"policy": actor.pid}
-    return status, result
+    session = job.session
+    try:
+        try:
+            run_episodes(session, job.actor, job.task, job.episodes, job.seed, outcome, on_episode)
+        except KeyboardInterrupt:
+            outcome.stopped = "interrupted"
+            console.print("  interrupted: braking, then drives off; Ctrl-C again for drives off at once")
+            _wind_down(session)
+            return Exit.INTERRUPTED
+    except Terminated:
+        outcome.stopped = "emergency stop by SIGTERM"
+        console.print(f"  {outcome.stopped}")
+        session.bring_to_rest(Verb.ESTOP)
+    return Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
 
 
 def _wind_down(session: Session) -> None:
@@ -169,8 +185,11 @@ def _terminable() -> Iterator[None]:
 
 
 def _summarise(console: Console, result: dict[str, Any]) -> None:
+    timing = result["timing"]
+    if not timing["ticks"]:
+        return
     reached = sum(episode["success"] for episode in result["episodes"])
-    timing, violations = result["timing"], result["safety"]["violations"]
+    violations = result["safety"]["violations"]
     console.print(f"{reached} of {len(result['episodes'])} reached; state {result['safety']['state']}", end="; ")
     console.print(f"violations {sum(violations.values())}, clipped ticks {result['safety']['clipped_ticks']}")
     if timing["tick_us"]:
@@ -179,6 +198,8 @@ def _summarise(console: Console, result: dict[str, Any]) -> None:
         console.print(
             f"tick p99 {timing['tick_us']['p99']:.0f} us, late p99 {late:.0f} us, {timing['overruns']} overruns"
         )
+    if timing["dropped"]:
+        console.print(f"[yellow]{timing['dropped']} ticks were overwritten before anybody had judged them[/]")
     if result["stopped"]:
         console.print("[bold red]stopped[/]", end=" ")
         console.print(result["stopped"], markup=False)

@@ -11,9 +11,11 @@ from enum import IntEnum
 import numpy as np
 
 from robotctl.control.kinematics import Kinematics
+from robotctl.control.lowering import gravity_share
 from robotctl.control.motion import Motion
 from robotctl.control.publisher import Publisher
-from robotctl.control.shared import Link
+from robotctl.control.pulse import Pulse
+from robotctl.control.shared import Link, Power
 from robotctl.hal.backend import Rig
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError, RobotctlError
@@ -32,8 +34,8 @@ _LARGEST_GAP = 25
 """Skipped periods that the reference follows; a longer gap shows as a tracking error."""
 _OPERATOR_SILENCE_NS = 1_000_000_000
 """Time without a beat from the operator's process after which what moves is stopped."""
-_LOWERING_S = 2.0
-"""Time over which gravity compensation fades before the drives of an arm without brakes go off."""
+_WATCHMAN_SILENCE_NS = 1_000_000_000
+"""The same for the watchman: an arm whose loop nobody watches does not move on."""
 
 
 class Verb(IntEnum):
@@ -85,8 +87,8 @@ class Loop:
         self._lowering_ns: int | None = None
         self._closing = False
         self._answer: tuple[int, str] | None = None
-        self._beats = 0
-        self._beat_ns = 0
+        self._operator = Pulse()
+        self._watchman = Pulse()
 
     # -- life -----------------------------------------------------------------------------------------------------
 
@@ -105,7 +107,7 @@ class Loop:
         if not self.closed:
             self.closed = True
             try:
-                self._arm.disable()
+                self._switch_off()
             finally:
                 self._arm.close()
 
@@ -145,7 +147,7 @@ class Loop:
             supervisor.trip(overrun)
         if self._link.desk.take_stop():
             self._serve_estop("the operator", now)
-        self._watch_operator(now)
+        self._watch_neighbours(now)
         supervisor.deadman.take(Grip(self._link.desk.grip), now)
         if self._estop:
             source, self._estop = self._estop, ""
@@ -228,16 +230,14 @@ class Loop:
             if self._damping and not clean:
                 self.supervisor.handle(Event.OFF_FAULT)
         if self._damping and sample.enabled and not self.supervisor.feedback.lost:
-            fade = 1.0
-            if self._lowering_ns is not None:
-                fade = 1.0 - (now - self._lowering_ns) / (_LOWERING_S * 1e9)
-            if fade > 0.0:
-                self._arm.write(self._motion.damp(sample.position, fade))
+            share = 1.0 if self._lowering_ns is None else gravity_share(self._lowering_ns, now)
+            if share > 0.0:
+                self._arm.write(self._motion.damp(sample.position, share))
                 return
         self._damping = False
         self._lowering_ns = None
         try:
-            self._arm.disable()
+            self._switch_off()
         except RobotctlError as error:
             # A drive that does not confirm keeps the arm from READY, but must not end the supervision of the others.
             clean = False
@@ -314,7 +314,7 @@ class Loop:
                 raise RobotctlError("the arm is being lowered first", "acknowledge again once it is down")
             case Verb.ACK:
                 if supervisor.handle(Event.ACK) is State.SILENT:
-                    self._arm.disable()
+                    self._switch_off()
                     self._selftest()
             case Verb.SELFTEST:
                 self._selftest()
@@ -338,15 +338,24 @@ class Loop:
     def _enable(self, now: int) -> None:
         # Drives that come on hold with the last feed-forward they were given.
         self._arm.write(self._motion.begin(self._arm.read().position))
+        self._link.watch.power = Power.CHANGING
         try:
             self._arm.enable()
         except RobotctlError as error:
             self.supervisor.trip(Trip(Protection.DRIVE, Category.BRAKE_OFF, str(error), now))
             raise
+        self._link.watch.power = Power.ON
         self._overrun.restart()
         sample = self._arm.read()
         self._motion.begin(sample.position)
         self.supervisor.begin_recovery_if_outside(sample, self.kinematics.tool(sample.position))
+
+    def _switch_off(self) -> None:
+        """Take the torque away, and let the watchman know that this may take its time."""
+        watch = self._link.watch
+        watch.power = min(watch.power, Power.CHANGING)
+        self._arm.disable()
+        watch.power = Power.OFF
 
     def _close(self, now: int) -> None:
         """Release the arm at once, or after a damped one was lowered."""
@@ -357,15 +366,21 @@ class Loop:
             self.supervisor.handle(Event.CLOSE)
             self.shut_down()
 
-    def _watch_operator(self, now: int) -> None:
-        """Stop what moves when the operator's process, once it has shown life, is suspended or blocked."""
-        beats = self._link.desk.beats
-        if beats != self._beats:
-            self._beats, self._beat_ns = beats, now
-        elif beats and now - self._beat_ns > _OPERATOR_SILENCE_NS and self.supervisor.state in (State.RUN, State.RESET):
-            cause = f"the operator's process has been silent for {_OPERATOR_SILENCE_NS / 1e9:g} s"
-            onset = self._beat_ns + _OPERATOR_SILENCE_NS
-            self.supervisor.trip(Trip(Protection.OPERATOR, Category.BRAKE_HOLD, cause, onset))
+    def _watch_neighbours(self, now: int) -> None:
+        """Stop what moves when operator or watchman, once they have shown life, are suspended, blocked or gone."""
+        beats, watched = self._link.desk.beats, self._link.watch.beats
+        silence = self._operator.silence_ns(beats, now)
+        unwatched = self._watchman.silence_ns(watched, now)
+        if self.supervisor.state not in (State.RUN, State.RESET):
+            return
+        if beats and silence > _OPERATOR_SILENCE_NS:
+            self._stop_unattended(Protection.OPERATOR, "operator's process", _OPERATOR_SILENCE_NS, silence, now)
+        if watched and unwatched > _WATCHMAN_SILENCE_NS:
+            self._stop_unattended(Protection.WATCHMAN, "watchman", _WATCHMAN_SILENCE_NS, unwatched, now)
+
+    def _stop_unattended(self, protection: Protection, who: str, limit_ns: int, silence_ns: int, now: int) -> None:
+        cause = f"the {who} has been silent for {limit_ns / 1e9:g} s"
+        self.supervisor.trip(Trip(protection, Category.BRAKE_HOLD, cause, now - silence_ns + limit_ns))
 
     def _serve_estop(self, source: str, now: int) -> None:
         cause = f"emergency stop by {source}; release it, then acknowledge"

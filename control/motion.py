@@ -7,6 +7,7 @@ import numpy as np
 
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
+from robotctl.control.lowering import damp
 from robotctl.control.reference import Reference
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
@@ -99,7 +100,7 @@ class Motion:
     def damp(self, position: Vector, share: float) -> Command:
         """Return the command that damps the joints with a share of their gravity compensated."""
         self.wanted, self.clip = self.rest, Clip.NONE
-        self.command = Command(CommandMode.DAMP, position, self.rest, share * self._kinematics.gravity(position))
+        self.command = damp(self._kinematics, position, share)
         return self.command
 
 

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from robotctl.control import registry
 from robotctl.control.loop import Loop, Verb
 from robotctl.control.process_tools import go_real_time, name_process, signal_on_parent_death
-from robotctl.control.shared import Link
+from robotctl.control.shared import Link, Power
 from robotctl.hal.backend import open_backend
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import ConfigError, RobotctlError
@@ -64,10 +64,7 @@ def main(text: str) -> int:
 
 
 def _run(loop: Loop, link: Link, clock: MonotonicClock, config: ProcessConfig) -> int:
-    claimed = None
     try:
-        if ":" in config.channel:  # others exist in this process only
-            claimed = registry.claim(config.channel)
         loop.bring_up()
         missing = go_real_time()
         text = f"real time without {' and '.join(missing)}" if missing else "real time: SCHED_FIFO, memory locked"
@@ -81,11 +78,10 @@ def _run(loop: Loop, link: Link, clock: MonotonicClock, config: ProcessConfig) -
     finally:
         statistics = loop.bus_statistics()
         try:
-            loop.shut_down()
+            if not (link.watch.beats and link.watch.power is Power.ON):  # else the watchman brings the arm down gently
+                loop.shut_down()
         finally:
             link.events.write({"type": "bus", "stamp_ns": clock.now_ns(), "statistics": statistics})
-            if claimed is not None:
-                claimed.close()
     return 0
 
 

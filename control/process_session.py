@@ -1,7 +1,8 @@
-"""A session whose loop runs in real time, in a control process."""
+"""A session whose loop runs in real time, in a control process, with a watchman beside it."""
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -14,20 +15,25 @@ from robotctl.control.loop import Verb
 from robotctl.control.process import ProcessConfig
 from robotctl.control.session import Session, history_slots
 from robotctl.control.shared import Link
+from robotctl.control.watchman import WatchmanConfig
+from robotctl.hal.can.channel import is_shared
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import ConfigError, HardwareError
 from robotctl.hal.robot import Robot
 from robotctl.safety.machine import State
+from robotctl.safety.trip import Protection
 
 _START_TIMEOUT_S = 30.0
 _BEAT_S = 0.05
 """How often the control process is shown that this one is alive."""
 _CLOSE_TIMEOUT_S = 6.0
+_RESCUE_TIMEOUT_S = 10.0
+"""Lowering an arm takes 2.5 s; drives that do not confirm, another second."""
 _CLOSABLE = (State.READY, State.FAULT, State.SILENT)
 
 
 class ProcessSession(Session):
-    """Starts, watches and ends one control process."""
+    """Starts, watches and ends one control process and its watchman."""
 
     def __init__(self, robot: Robot, backend: str, channel: str = "", overrides: Sequence[str] = ()) -> None:
         super().__init__(robot, MonotonicClock(), Link.create(robot.dof, history_slots(robot)))
@@ -35,14 +41,23 @@ class ProcessSession(Session):
         self._channel = channel
         self._overrides = list(overrides)
         self._process: subprocess.Popen[bytes] | None = None
+        self._watchman: subprocess.Popen[bytes] | None = None
+        self._claim: socket.socket | None = None
         self._bus: dict[str, object] | None = None
         self._error: dict[str, Any] | None = None
+        self._bereaved = ""
+        """What the watchman said when it took the place of the loop."""
         self._complaints = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close()
 
     @property
     def pid(self) -> int | None:
         """Pid of the control process."""
         return self._process.pid if self._process else None
+
+    @property
+    def watchman_pid(self) -> int | None:
+        """Pid of the watchman."""
+        return self._watchman.pid if self._watchman else None
 
     @property
     def fds(self) -> tuple[int, int]:
@@ -63,15 +78,21 @@ class ProcessSession(Session):
             slots=self.link.ticks.slots,
             operator=os.getpid(),
         )
+        shared = [mailbox, board]
+        if is_shared(self._channel):
+            # Inherited, so that the channel is taken for as long as any of the three processes lives.
+            self._claim = registry.claim(self._channel)
+            shared.append(self._claim.fileno())
         self._process = subprocess.Popen(
             [sys.executable, "-m", "robotctl.control.process", config.to_json()],
-            pass_fds=(mailbox, board),
+            pass_fds=shared,
             stdin=subprocess.DEVNULL,
             stderr=self._complaints,
             start_new_session=True,  # Ctrl-C in the terminal must not reach it
         )
+        self._start_watchman(self._process.pid, shared)
         deadline = time.monotonic() + _START_TIMEOUT_S
-        while self.link.ticks.latest() is None or self.state is not State.READY:
+        while not self.link.watch.beats or self.state is not State.READY:
             self._check()
             if time.monotonic() > deadline:
                 raise HardwareError("the control process did not come up", "run robotctl doctor")
@@ -89,18 +110,62 @@ class ProcessSession(Session):
             time.sleep(min(_BEAT_S, remaining))
         self.poll()
 
+    def bring_to_rest(self, verb: Verb) -> None:
+        self._check()  # an arm that its watchman brought down looks like one at rest
+        super().bring_to_rest(verb)
+
     def close(self) -> None:
         process = self._process
         if process is not None and process.poll() is None:
             self._bring_down(process)
         if process is not None:
             registry.unregister(process.pid)
+            self._await_watchman()
             self.poll()
         self._complaints.close()
+        if self._claim is not None:
+            self._claim.close()
         if self.link.fds is not None:
             for fd in self.link.fds:
                 os.close(fd)
             self.link.fds = None
+
+    def _start_watchman(self, control: int, shared: list[int]) -> None:
+        mailbox, board = self.fds
+        control_fd = os.pidfd_open(control)  # ours until it is waited for, so that no other process can be meant
+        try:
+            config = WatchmanConfig(
+                robot=str(self.robot.source),
+                overrides=self._overrides,
+                backend=self._backend,
+                channel=self._channel,
+                mailbox_fd=mailbox,
+                board_fd=board,
+                slots=self.link.ticks.slots,
+                control=control,
+                control_fd=control_fd,
+                operator=os.getpid(),
+            )
+            self._watchman = subprocess.Popen(
+                [sys.executable, "-m", "robotctl.control.watchman", config.to_json()],
+                pass_fds=[*shared, control_fd],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # it sounds its alarm on stderr, which is ours
+                start_new_session=True,
+            )
+        finally:
+            os.close(control_fd)
+
+    def _await_watchman(self) -> None:
+        """Wait until the watchman, too, is done: the control process has ended."""
+        if self._watchman is None:
+            return
+        try:
+            self._watchman.wait(_RESCUE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._watchman.kill()
+            self._watchman.wait()
+        registry.unregister(self._watchman.pid)
 
     def bus_statistics(self) -> dict[str, object] | None:
         return self._bus
@@ -111,6 +176,10 @@ class ProcessSession(Session):
             self._bus = event["statistics"]
         elif event["type"] == "error":
             self._error = event
+        elif (
+            event["type"] == "trip" and event["protection"] == Protection.WATCHMAN.label and not event["stop_category"]
+        ):
+            self._bereaved = event["text"]
 
     def _bring_down(self, process: subprocess.Popen[bytes]) -> None:
         deadline = time.monotonic() + _CLOSE_TIMEOUT_S
@@ -135,9 +204,10 @@ class ProcessSession(Session):
         """Raise if the control process is gone."""
         if self._process is None:
             raise HardwareError("the session is not open", "use it as a context manager")
-        status = self._process.poll()
+        status = self._process.wait() if self._bereaved else self._process.poll()
         if status is None:
             return
+        self._await_watchman()
         self.poll()
         if self._error is not None:
             error = ConfigError if self._error["kind"] == "config" else HardwareError
@@ -148,7 +218,5 @@ class ProcessSession(Session):
             raise ConfigError(complaint)
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         detail = f"\n{complaint}" if complaint else ""
-        raise HardwareError(
-            f"the control process {how}; the drives go off by their own watchdogs{detail}",
-            "look at the arm, then start again",
-        )
+        what = self._bereaved or "the drives go off by their own watchdogs"
+        raise HardwareError(f"the control process {how}: {what}{detail}", "look at the arm, then start again")

@@ -10,7 +10,9 @@ _PR_SET_PDEATHSIG = 1
 _PR_SET_NAME = 15
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
-_FIFO_PRIORITY = 50
+CONTROL_PRIORITY = 50
+WATCHMAN_PRIORITY = 51
+"""Above the one it watches: equals do not displace each other, and a loop that spins would never be caught."""
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -26,14 +28,14 @@ def signal_on_parent_death(number: signal.Signals, parent: int) -> None:
         os.kill(os.getpid(), number)
 
 
-def go_real_time() -> list[str]:
+def go_real_time(priority: int = CONTROL_PRIORITY) -> list[str]:
     """Take what the machine allows of real-time scheduling, and return what was not allowed.
 
     SCHED_FIFO, all memory locked, garbage collector frozen and off: the loop allocates no cycles.
     """
     missing = []
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_FIFO_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
         missing.append("SCHED_FIFO")
     # Locking under a finite limit would make later allocations fail rather than page.

@@ -85,7 +85,7 @@ def _beside(
     recorder = RecorderProcess.start(
         session.robot, session.fds[1], session.link.ticks.slots, recording.path, about, overrides
     )
-    recording.processes = {"control": session.pid, "recorder": recorder.pid}
+    recording.processes = {"control": session.pid, "watchman": session.watchman_pid, "recorder": recorder.pid}
     try:
         yield
     finally:

@@ -27,6 +27,8 @@ class Running:
     robot: str
     backend: str
     channel: str
+    watches: int = 0
+    """Of a watchman: pid of its control process. It counts once that is gone, while it brings the arm down."""
 
 
 def folder() -> Path:
@@ -49,10 +51,10 @@ def start_time(pid: int) -> int | None:
     return None if fields[0] in "ZX" else int(fields[19])
 
 
-def register(robot: str, backend: str, channel: str, operator: int) -> Path:
+def register(robot: str, backend: str, channel: str, operator: int, watches: int = 0) -> Path:
     """Enter this process, and return its file, which the caller removes at its end."""
     pid = os.getpid()
-    entry = Running(pid, start_time(pid) or 0, operator, robot, backend, channel)
+    entry = Running(pid, start_time(pid) or 0, operator, robot, backend, channel, watches)
     folder().mkdir(mode=0o700, parents=True, exist_ok=True)
     path = folder() / f"{pid}.json"
     path.write_text(json.dumps(asdict(entry)))
@@ -85,7 +87,7 @@ def unregister(pid: int) -> None:
 
 
 def running() -> list[Running]:
-    """Return the control processes of this user that are alive."""
+    """Return the control processes of this user that are alive, and the watchmen of those that are not."""
     found = []
     for path in sorted(folder().glob("*.json")):
         try:
@@ -93,7 +95,7 @@ def running() -> list[Running]:
         except (OSError, ValueError, TypeError):
             continue  # being written, or just removed
         if start_time(entry.pid) == entry.started:
-            found.append(entry)
+            found += [entry] if not entry.watches or start_time(entry.watches) is None else []
         else:
             unregister(entry.pid)
     return found

@@ -107,7 +107,9 @@ class Session(ABC):
 
     @property
     def state(self) -> State:
-        return State(int(self.latest()["state"]))
+        """The supervisor's state at the newest tick; OFF before the first."""
+        record = self.link.ticks.latest()
+        return State.OFF if record is None else State(int(record["state"]))
 
     def poll(self) -> None:
         """Take in what happened since the last call: ticks into judge and statistics, trips and answers from events."""

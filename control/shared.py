@@ -14,6 +14,7 @@ import mmap
 import os
 import struct
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, Self
 
 import numpy as np
@@ -145,6 +146,45 @@ class Desk:
         return self._stops != before
 
 
+class Power(IntEnum):
+    """What a loop has of its drives."""
+
+    OFF = 0
+    """They are off, and have confirmed it."""
+    CHANGING = 1
+    """They come on or go off; the loop may stand still over it."""
+    ON = 2
+    """They are on, and the loop feeds them in every tick."""
+
+
+class Watch:
+    """Between a loop and its watchman: the loop says what it has of its drives, the watchman shows that it is alive."""
+
+    OFFSET = Desk.SIZE
+    SIZE = 16
+    """Words: power, beats."""
+
+    def __init__(self, buffer: Buffer, offset: int = 0) -> None:
+        self._words = _words(buffer, offset, self.SIZE // 8)
+
+    @property
+    def power(self) -> Power:
+        return Power(self._words[0])
+
+    @power.setter
+    def power(self, power: Power) -> None:
+        self._words[0] = power
+
+    def beat(self) -> None:
+        """Show that the watchman is alive."""
+        self._words[1] += 1
+
+    @property
+    def beats(self) -> int:
+        """Number of beats so far; 0 where there is no watchman, as in lockstep."""
+        return self._words[1]
+
+
 TICK_HEAD = struct.Struct("<qqqqqqqq")
 """The integer fields of a record, in order."""
 
@@ -213,6 +253,12 @@ class TickRing:
         struct.pack_into("<q", self._buffer, end - 8, duration_ns)
         self._head[0] = number + 1
 
+    def append(self, record: np.void) -> None:
+        """Write a whole record behind the last one, and make it visible."""
+        number = self.head
+        self.records[number % self.slots] = record
+        self._head[0] = number + 1
+
     def latest(self) -> np.void | None:
         """Return a copy of the newest record, or None before the first."""
         head = self.head
@@ -279,6 +325,7 @@ class Link:
 
     mailbox: Mailbox
     desk: Desk
+    watch: Watch
     events: EventRing
     ticks: TickRing
     fds: tuple[int, int] | None = None
@@ -313,6 +360,7 @@ class Link:
         return cls(
             Mailbox(mailbox),
             Desk(board, 0),
+            Watch(board, Watch.OFFSET),
             EventRing(board, 64),
             TickRing(board, 64 + EventRing.SIZE, dof, slots),
             fds,

@@ -58,6 +58,7 @@ class TickStatistics:
             "ticks": self.ticks,
             "servo_hz": round((self.ticks - 1) / elapsed * 1e9, 2) if elapsed > 0 else 0.0,
             "overruns": self.overruns,
+            "dropped": self.dropped,
             "tick_us": percentiles_us(np.concatenate(self._durations) if self._durations else none),
             "lateness_us": percentiles_us(np.concatenate(self._lateness) if self._lateness else none),
         }

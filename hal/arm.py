@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
+from robotctl.hal.errors import HardwareError
 from robotctl.hal.types import Command, GripperSample, Sample, Sent, Truth
 
 
@@ -77,6 +78,17 @@ class Arm(ABC):
     @abstractmethod
     def close(self) -> None:
         """Release everything. Harmless when already closed. Does not move or disable anything by itself."""
+
+    def take_over(self, command: Command) -> None:
+        """Instead of `connect`, `verify` and `enable`: take drives that another process had enabled, and is gone.
+
+        They are asked nothing first: `command` goes out at once, and frames may be written from now on. Its position
+        is where the joints were last, which tells whole turns apart.
+
+        Raises:
+            HardwareError: if the drives cannot be reached, or went with that process.
+        """
+        raise HardwareError("there is nothing to take over: the arm lives in the process that drives it")
 
     def truth(self) -> Truth | None:
         """Return the true state of the plant behind this arm, or None where only measurements exist."""

@@ -5,6 +5,7 @@ imports no simulation. Nothing is sent by opening.
 """
 
 import errno
+import importlib
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -49,6 +50,20 @@ _OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NotIm
 """NameError is what some of python-can's interfaces end in where the vendor's library is missing."""
 
 
+def is_shared(name: str) -> bool:
+    """Return whether other processes reach the drives behind a channel, too."""
+    interface, _, where = name.partition(":")
+    private = {entry.name for entry in entry_points(group="robotctl.channels")} | {"virtual"}
+    return bool(where) and interface not in private
+
+
+def prepare_channel(name: str) -> None:
+    """Load now what `open_channel` would have to load first, so that it will open in milliseconds."""
+    backend = can.interfaces.BACKENDS.get(name.partition(":")[0])
+    if backend is not None:
+        importlib.import_module(backend[0])
+
+
 def open_channel(name: str, robot: Robot, clock: Clock) -> Channel:
     """Open a channel by name.
 
@@ -56,6 +71,15 @@ def open_channel(name: str, robot: Robot, clock: Clock) -> Channel:
         ConfigError: if the name has no known form, or the robot has no CAN drives.
         BusError: if it cannot be opened.
     """
+    return _open(name, robot, clock, SLCAN_SETTLE_S)
+
+
+def reopen_channel(name: str, robot: Robot, clock: Clock) -> Channel:
+    """Open a channel that was open until just now, so that nothing has to settle. Raises as `open_channel` does."""
+    return _open(name, robot, clock, 0.0)
+
+
+def _open(name: str, robot: Robot, clock: Clock, settle_s: float) -> Channel:
     wiring = robot.profile.can
     if wiring is None:
         raise ConfigError(
@@ -75,7 +99,7 @@ def open_channel(name: str, robot: Robot, clock: Clock) -> Channel:
             f"unknown channel {name!r}: python-can has no interface {interface!r}",
             f"use {FORMS}: {', '.join(sorted(can.VALID_INTERFACES))}",
         )
-    bus = open_bus(interface, where, options(interface, wiring))
+    bus = open_bus(interface, where, options(interface, wiring, settle_s))
     return Channel(bus, fd=wiring.fd and bus.protocol is not can.CanProtocol.CAN_20)
 
 
@@ -91,7 +115,7 @@ def open_bus(interface: str, where: str, options: Mapping[str, Any]) -> can.BusA
         raise BusError(f"cannot open {interface}:{where}: {error}", _remedy(interface, where, error)) from error
 
 
-def options(interface: str, wiring: CanBus) -> dict[str, Any]:
+def options(interface: str, wiring: CanBus, settle_s: float = SLCAN_SETTLE_S) -> dict[str, Any]:
     """Return what an interface of python-can has to be told of the wiring."""
     match interface:
         case "virtual":
@@ -99,7 +123,7 @@ def options(interface: str, wiring: CanBus) -> dict[str, Any]:
         case "socketcan" | "udp_multicast":
             return {"fd": wiring.fd}
         case "slcan":
-            return {"bitrate": wiring.bitrate, "sleep_after_open": SLCAN_SETTLE_S}
+            return {"bitrate": wiring.bitrate, "sleep_after_open": settle_s}
         case _:
             return {"bitrate": wiring.bitrate}
 

@@ -110,6 +110,8 @@ class Server:
         """Replies that did not leave: CAN FD on a classic channel, or a queue that was full."""
         self.on_status: Callable[[DamiaoDrive, int, float], None] | None = None
         """Called when a drive's status changes: the drive, its old status, seconds since it last heard a frame."""
+        self.on_frame: Callable[[can.Message], None] | None = None
+        """Called for every frame in either direction, with the drives' time of it."""
         self._bench = bench
         self._port = port
         self._clock = clock
@@ -137,6 +139,9 @@ class Server:
             if frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id:
                 continue
             self.received += 1
+            if self.on_frame is not None:
+                frame.timestamp = bench.now_ns * 1e-9
+                self.on_frame(frame)
             bench.receive(frame.arbitration_id, frame.data)
         replies = bench.replies
         while replies:
@@ -150,6 +155,8 @@ class Server:
                 bitrate_switch=fd,
                 is_rx=False,
             )
+            if self.on_frame is not None:
+                self.on_frame(reply)
             if (fd and not self._port.fd) or not self._port.send(reply):
                 self.lost += 1
             else:

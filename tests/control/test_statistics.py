@@ -52,6 +52,7 @@ def test_ticks_that_nobody_read_still_happened():
     statistics.take(ticks(100, first=400), dropped=300)
     assert statistics.dropped == 300
     assert statistics.report()["ticks"] == 500
+    assert statistics.report()["dropped"] == 300
     assert statistics.report()["servo_hz"] == 500.0
 
 
@@ -75,4 +76,11 @@ def test_the_buffer_may_be_reused_after_taking():
 
 def test_nothing_taken():
     report = TickStatistics(PERIOD).report()
-    assert report == {"ticks": 0, "servo_hz": 0.0, "overruns": 0, "tick_us": None, "lateness_us": None}
+    assert report == {
+        "ticks": 0,
+        "servo_hz": 0.0,
+        "overruns": 0,
+        "dropped": 0,
+        "tick_us": None,
+        "lateness_us": None,
+    }

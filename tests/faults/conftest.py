@@ -39,7 +39,12 @@ class Run:
 
     def pids(self) -> dict[str, int]:
         """Pids of the children by their part, as ps shows them."""
-        parts = {"robotctl-ctl": "control", "robotctl-policy": "policy", "robotctl-rec": "recorder"}
+        parts = {
+            "robotctl-ctl": "control",
+            "robotctl-watch": "watchman",
+            "robotctl-policy": "policy",
+            "robotctl-rec": "recorder",
+        }
         found = {}
         for pid in _children(self.process.pid):
             try:
@@ -51,11 +56,11 @@ class Run:
         return found
 
     def wait_running(self, timeout_s: float = 30.0) -> dict[str, int]:
-        """Return the pids once all three parts run and the first episode has begun."""
+        """Return the pids once all four parts run and the first episode has begun."""
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             pids = self.pids()
-            if len(pids) == 3:
+            if len(pids) == 4:
                 time.sleep(1.5)  # armed and on its way
                 return pids
             assert self.process.poll() is None, self.process.communicate()[0]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from robotctl.hal.arm import Arm, Inspector
-from robotctl.hal.can.channel import Channel, open_channel
+from robotctl.hal.can.channel import Channel, is_shared, open_channel, reopen_channel
 from robotctl.hal.can.damiao.codec import KD_MAX, KP_MAX, Special, Status
 from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, DrivesError, Identity, raise_problems
 from robotctl.hal.can.damiao.faults import fault_of, status_name
@@ -94,9 +94,10 @@ class DamiaoArm(Arm):
     # --- life -------------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        if self._open:
-            return
-        channel = open_channel(self._name, self._robot, self._clock)
+        if not self._open:
+            self._use(open_channel(self._name, self._robot, self._clock))
+
+    def _use(self, channel: Channel) -> None:
         if isinstance(self._clock, VirtualClock) and not channel.simulated:
             channel.bus.shutdown()
             raise ConfigError(
@@ -182,6 +183,31 @@ class DamiaoArm(Arm):
             self.disable()
             raise
         self._enabled = True
+
+    def take_over(self, command: Command) -> None:
+        """Take drives that another process had enabled; see `Arm.take_over`. Their ranges are the profile's motors'.
+
+        Returns once every drive has answered, or after 20 ms. The gripper, if it has, holds its opening.
+
+        Raises:
+            HardwareError: on channels whose drives live in the process that opened them.
+            BusError: if the channel cannot be opened.
+        """
+        if not is_shared(self._name):
+            super().take_over(command)
+        self._use(reopen_channel(self._name, self._robot, self._clock))
+        self._verified = self._enabled = True
+        transport, drives, angles = self._require_open(), self._drives, command.position.tolist()
+        for drive, angle in zip(self._joints, angles, strict=True):
+            drive.position = angle
+        self.write(command)
+        if self.gripper:
+            drives[-1].poll()
+        transport.wait(lambda: all(drive.heard for drive in drives), CONFIRM_TIMEOUT_S)
+        for drive, expected, angle in zip(self._joints, self._expected, angles, strict=False):
+            drive.fold_near(angle, expected.turn)
+        if self.gripper and drives[-1].heard:
+            self.gripper.engage()
 
     def read(self) -> Sample:
         """Return the latest sample; angles are NaN, with stamp 0, until a joint is first heard of.

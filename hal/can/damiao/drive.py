@@ -150,6 +150,12 @@ class Drive:
         self._from_velocity = (2.0 * vmax / _U12 / scale, -vmax / scale)
         self._from_effort = (2.0 * tmax / _U12 * scale, -tmax * scale)
 
+    def fold_near(self, angle: float, turn: float) -> None:
+        """Fold by whole turns (rad of the joint), so that the measured angle is the one closest to `angle`."""
+        fold = -turn * round((self.position - angle) / turn)
+        self.adopt(self.ranges, self.fold + fold)
+        self.position += fold
+
     # --- the fast path ----------------------------------------------------------------------------------------------
 
     def gains(self, kp: float, kd: float) -> int:
