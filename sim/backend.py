@@ -137,7 +137,8 @@ class SimArm(Arm):
         if self._noisy:
             position = position + self._rng.normal(0.0, self._twin.noise_position, position.shape)
             velocity = velocity + self._rng.normal(0.0, self._twin.noise_velocity, velocity.shape)
-        stamps, on = self._ones * now, self._enabled and not self._off
+        # A drive without power says nothing, so that nothing tells it from one that is on.
+        stamps, on = self._ones * now, self._enabled and not self._off - self._unpowered
         return Sample(now, position, velocity, truth.effort, stamps, self._faults, on, self._temperature)
 
     def write(self, command: Command) -> Sent:

@@ -41,6 +41,8 @@ class TroubledArm(Arm):
     def __init__(self, arm: Arm) -> None:
         self.arm = arm
         self.troubles: list[Trouble] = []
+        self.seen: Sample | None = None
+        """The latest sample that the loop got to see."""
 
     def inspect_with(self, inspector: Inspector) -> None:
         self.arm.inspect_with(inspector)
@@ -61,6 +63,7 @@ class TroubledArm(Arm):
         for trouble in self.troubles:
             trouble.on_plant()
             sample = trouble.on_read(sample)
+        self.seen = sample
         return sample
 
     def write(self, command: Command) -> Sent:
@@ -97,20 +100,19 @@ class TroubledArm(Arm):
 
 
 class Mute(Trouble):
-    """Some joints are not heard of: they stay what they were, and their stamps grow old."""
+    """Some joints are not heard of: they stay what they were in the last sample, and their stamps grow old."""
 
-    def __init__(self, axes: Iterable[int]) -> None:
+    def __init__(self, axes: Iterable[int], last: Sample) -> None:
         self._axes = list(axes)
-        self._last: Sample | None = None
+        self._last = last
 
     def on_read(self, sample: Sample) -> Sample:
-        last = self._last = self._last or sample
         self.acted += 1
         fields = ("position", "velocity", "effort", "joint_stamp_ns")
-        frozen = {field: getattr(sample, field).copy() for field in fields}
-        for field, values in frozen.items():
-            values[self._axes] = getattr(last, field)[self._axes]
-        return sample._replace(**frozen)
+        mixed = {field: getattr(sample, field).copy() for field in fields}
+        for field, values in mixed.items():
+            values[self._axes] = getattr(self._last, field)[self._axes]
+        return sample._replace(**mixed)
 
 
 class Misread(Trouble):

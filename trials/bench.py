@@ -16,8 +16,9 @@ from robotctl.hal.errors import HardwareError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
 from robotctl.safety.machine import State
-from robotctl.safety.target import JointVelocity, Target
+from robotctl.safety.target import Target
 from robotctl.sim.backend import SimArm
+from robotctl.sim.motors.bench import Bench as Motors
 from robotctl.sim.motors.bus import EmulatedBus
 from robotctl.sim.plant import Plant
 from robotctl.sim.trouble import TroubledArm
@@ -39,6 +40,7 @@ class Bench:
     def __init__(self, robot: Robot, backend: str, seed: int = 0) -> None:
         self.robot = robot
         self.backend = backend
+        self.seed = seed
         self.random = np.random.default_rng(seed)
         self.clock = VirtualClock(_START_NS)
         self.link = Link.local(robot.dof, round(_HISTORY_S * robot.profile.servo_hz))
@@ -52,6 +54,7 @@ class Bench:
         self._targets = 0
         self._begun_ns = 0
         self._due_ns = 0
+        self._late = 0.0
 
     def __enter__(self) -> Self:
         self.loop.bring_up()
@@ -80,12 +83,15 @@ class Bench:
         return channel.bus if channel is not None and isinstance(channel.bus, EmulatedBus) else None
 
     @property
+    def motors(self) -> Motors:
+        """The emulated motors; there are some unless the arm is the twin."""
+        if self.bus is None:
+            raise HardwareError(f"there are no emulated motors behind {self.backend}")
+        return self.bus.bench
+
+    @property
     def plant(self) -> Plant:
-        if self.twin is not None:
-            return self.twin.plant
-        if self.bus is not None:
-            return self.bus.bench.plant
-        raise HardwareError(f"there is no simulated plant behind {self.backend}")
+        return self.twin.plant if self.twin else self.motors.plant
 
     # -- time -----------------------------------------------------------------------------------------------------
 
@@ -97,9 +103,22 @@ class Bench:
     def state(self) -> State:
         return self.loop.supervisor.state
 
-    def tick(self, periods: float = 1.0) -> State:
-        """Let some servo periods pass and make one tick, with the policy's target if one is due."""
-        self.clock.sleep_until(self.now_ns + round(periods * self.robot.period_ns))
+    @property
+    def position(self) -> Vector:
+        """Measured joints (n,) of the last tick, rad."""
+        record = self.link.ticks.latest()
+        assert record is not None
+        return np.array(record["position"])
+
+    def tick(self, late: float = 0.0) -> State:
+        """Make the tick that is due next, some servo periods late, with the policy's target if one is due.
+
+        As in real time, deadlines are absolute, and missed ones are skipped.
+        """
+        period = self.robot.period_ns
+        self.clock.sleep_until(self.now_ns + round((1.0 + late - self._late) * period))
+        self.loop.lateness_ns, self.loop.skipped = round(late * period), int(late)
+        self._late = late % 1.0
         if self.policy is not None and self.now_ns >= self._due_ns:
             self._due_ns += round(POLICY_S * 1e9)
             target = self.policy(self, (self.now_ns - self._begun_ns) * 1e-9)
@@ -159,10 +178,6 @@ class Bench:
         self.demand(Verb.START)
 
     # -- the policy -----------------------------------------------------------------------------------------------
-
-    def velocity(self, values: Vector) -> JointVelocity:
-        """Return the next target: joint velocities (n,), rad/s."""
-        return JointVelocity(np.asarray(values, dtype=np.float64), *self.stamp())
 
     def stamp(self) -> tuple[int, int, int]:
         """Return epoch, sequence number and deadline of the next target."""

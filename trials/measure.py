@@ -18,8 +18,8 @@ class Stop:
 
     reaction_s: float
     """From the onset to the first stopping command."""
-    standstill_s: float | None
-    """From that command to rest; None if the arm never came to rest."""
+    standstill_s: float
+    """From that command to rest; infinite if the arm never came to rest."""
     joint_way: float
     """Largest distance of a joint from where it was at the onset, rad, until rest."""
     tool_way: float
@@ -50,7 +50,7 @@ def measure_stop(records: NDArray[Any], onset_ns: int, robot: Robot) -> Stop | N
     position, tool = records["true_position"], records["true_tool"]
     return Stop(
         reaction * 1e-9,
-        int(stamps[rest] - stamps[first]) * 1e-9 if at_rest else None,
+        int(stamps[rest] - stamps[first]) * 1e-9 if at_rest else np.inf,
         float(np.abs(position[way] - position[0]).max()),
         float(np.linalg.norm(tool[way] - tool[0], axis=1).max()),
         float(np.abs(position[rest:] - position[rest]).max()) if at_rest else np.inf,

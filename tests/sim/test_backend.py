@@ -172,7 +172,9 @@ def test_a_drive_that_fails_leaves_the_others_at_work() -> None:
 def test_drives_without_power_have_no_torque_and_do_not_enable() -> None:
     twin = Twin()
     twin.arm.power_down([2])
-    assert twin.pass_ms(10, feeding=True).faults == ()
+    sample = twin.pass_ms(10, feeding=True)
+    assert sample.faults == ()
+    assert sample.enabled
     assert twin.arm.truth().effort[2] == 0.0
     twin.arm.disable()
     with pytest.raises(HardwareError, match="panda_joint3"):
