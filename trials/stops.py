@@ -63,7 +63,6 @@ def stop_scenario(
     fault: Fault,
     expected: Expected,
     start: Start = running,
-    overrides: Sequence[str] = (),
 ) -> Scenario:
     """Return the scenario that plants a fault under a moving arm."""
 
