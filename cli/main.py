@@ -5,6 +5,7 @@ import typer
 from robotctl.cli.bench import bench_app
 from robotctl.cli.doctor import doctor
 from robotctl.cli.emulate import emulate
+from robotctl.cli.faults import faults
 from robotctl.cli.run import run
 from robotctl.cli.scan import scan
 from robotctl.cli.stop import stop
@@ -15,7 +16,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for verb in (run, stop, scan, doctor, emulate):
+for verb in (run, stop, scan, doctor, emulate, faults):
     app.command()(verb)
 app.add_typer(bench_app, name="bench")
 

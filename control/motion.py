@@ -40,6 +40,7 @@ class Motion:
         self._torque_limiter = TorqueLimiter(robot)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
+        self._stale_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
         _refuse_forbidden_poses(robot, kinematics)
 
     def begin(self, position: Vector) -> Command:
@@ -61,8 +62,11 @@ class Motion:
             reference.resync(sample.position, sample.velocity)
         self.wanted, self.clip = wanted, Clip.NONE
         self._before = reference.mark()
+        # What is no longer heard of is taken to be where it was led: an old error must not drive the integrator.
+        stale = sample.stamp_ns - int(sample.joint_stamp_ns.min()) > self._stale_ns
         for _ in range(periods):
-            self.command = reference.step(self._shape(wanted, brake), sample.position)
+            velocity = self._shape(wanted, brake)
+            self.command = reference.step(velocity, reference.position if stale else sample.position)
         return self.command
 
     def take_back(self) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -11,8 +12,13 @@ from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError, HardwareError
 from robotctl.hal.profile import GripperProfile
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Command, CommandMode, GripperSample, Sample, Sent, Truth
-from robotctl.sim.plant import Plant
+from robotctl.hal.types import Command, CommandMode, Fault, GripperSample, Sample, Sent, Truth, Vector, frozen
+from robotctl.sim.motors.thermal import AMBIENT, Thermal
+from robotctl.sim.plant import WATCHDOG_SHARE, Plant
+
+_WARM_NS = 100_000_000
+"""Step of the thermal models."""
+_COMMUNICATION_LOST = 0xD
 
 
 def open_sim(robot: Robot, clock: Clock, channel: str = "") -> Rig:
@@ -26,11 +32,16 @@ def open_sim(robot: Robot, clock: Clock, channel: str = "") -> Rig:
 
 
 class SimArm(Arm):
-    """An arm in MuJoCo, with the lag, delay, noise and payload of the profile's `twin`."""
+    """An arm in MuJoCo, with the lag, delay, noise and payload of the profile's `twin`.
+
+    Its drives have what real ones have: a watchdog, which switches them off when no command comes, faults, which stay
+    until they are cleared, and a temperature.
+    """
 
     def __init__(self, robot: Robot, plant: Plant, clock: Clock, seed: int = 0) -> None:
         self._plant = plant
         self._clock = clock
+        self._names = [joint.name for joint in robot.profile.joints]
         self._twin = robot.profile.twin
         self._rng = np.random.default_rng(seed)
         gains = [joint.gains for joint in robot.profile.joints]
@@ -45,11 +56,47 @@ class SimArm(Arm):
         self._connected = False
         self._enabled = False
         self._inspector: Inspector | None = None
+        self._timeout_ns = round(WATCHDOG_SHARE * robot.profile.safety.drive_timeout_s * 1e9)
+        self._fed_ns = 0
+        self._faults: tuple[Fault, ...] = ()
+        self._unpowered: set[int] = set()
+        self._off: set[int] = set()
+        """Drives that went off by themselves since they were enabled."""
+        self._largest = robot.limits.torque
+        self._thermals = [Thermal() for _ in self._names]
+        self._temperature: Vector = frozen([AMBIENT] * robot.dof)
+        self._warm_ns = clock.now_ns() + _WARM_NS
+
+    @property
+    def plant(self) -> Plant:
+        """What it stands in front of."""
+        return self._plant
 
     @property
     def enabled(self) -> bool:
         """Whether its drives are on."""
         return self._enabled
+
+    @property
+    def gains(self) -> tuple[Vector, Vector]:
+        """Stiffness (n,), Nm/rad, and damping (n,), Nms/rad, that its drives track with."""
+        return self._kp, self._kd
+
+    def fail(self, axes: Iterable[int], code: int, name: str, hint: str) -> None:
+        """Let the drives of some joints go off by themselves, with a fault that stays until it is cleared."""
+        self._faults += tuple(Fault(self._names[axis], code, name, hint) for axis in axes)
+        self._switch_off(axes)
+
+    def power_down(self, axes: Iterable[int]) -> None:
+        """Take the supply from some drives: no torque, and nothing kept of their faults."""
+        self._unpowered.update(axes)
+        names = {self._names[axis] for axis in axes}
+        self._faults = tuple(fault for fault in self._faults if fault.joint not in names)
+        self._switch_off(axes)
+
+    def power_up(self, axes: Iterable[int]) -> None:
+        """Give the supply back; the drives stay off."""
+        self._unpowered.difference_update(axes)
 
     def inspect_with(self, inspector: Inspector) -> None:
         self._inspector = inspector
@@ -59,15 +106,19 @@ class SimArm(Arm):
 
     def verify(self) -> None:
         self._require_connected()
+        self._require_healthy()
 
     def enable(self) -> None:
         self._require_connected()
-        if not self._enabled:
+        self._require_healthy()
+        if not self._enabled or self._off:
             refusal = self._inspector.enabling() if self._inspector else ""
             if refusal:
                 raise HardwareError(f"the drives were not enabled: {refusal}")
-            self._plant.advance(self._clock.now_ns())
+            self._fed_ns = self._clock.now_ns()
+            self._plant.advance(self._fed_ns)
             self._enabled = True
+            self._off.clear()
             holding = self._holding()
             for axis in range(self._plant.dof):
                 self._plant.drive(
@@ -80,11 +131,15 @@ class SimArm(Arm):
         now = self._clock.now_ns()
         self._deliver(now)
         truth = self._truth = self._plant.truth()
+        if now >= self._warm_ns:
+            self._warm(truth.effort, now)
         position, velocity = truth.position, truth.velocity
         if self._noisy:
             position = position + self._rng.normal(0.0, self._twin.noise_position, position.shape)
             velocity = velocity + self._rng.normal(0.0, self._twin.noise_velocity, velocity.shape)
-        return Sample(now, position, velocity, truth.effort, self._ones * now, (), self._enabled)
+        # A drive without power says nothing, so that nothing tells it from one that is on.
+        stamps, on = self._ones * now, self._enabled and not self._off - self._unpowered
+        return Sample(now, position, velocity, truth.effort, stamps, self._faults, on, self._temperature)
 
     def write(self, command: Command) -> Sent:
         if not self._enabled:
@@ -94,8 +149,9 @@ class SimArm(Arm):
         refusal = self._inspector.command(command) if self._inspector else ""
         if refusal:
             return Sent(command, f"not sent: {refusal}", delivered=False)
+        self._fed_ns = self._clock.now_ns()
         if self._delay_ns:
-            self._waiting.append((self._clock.now_ns() + self._delay_ns, command))
+            self._waiting.append((self._fed_ns + self._delay_ns, command))
         else:
             self._apply(command)
         return Sent(command)
@@ -114,6 +170,7 @@ class SimArm(Arm):
 
     def clear_faults(self) -> None:
         self._require_connected()
+        self._faults = ()
 
     def close(self) -> None:
         self._connected = False
@@ -137,6 +194,21 @@ class SimArm(Arm):
         return math.isfinite(position @ position + velocity @ velocity + effort @ effort)
 
     def _deliver(self, now: int) -> None:
+        """Let time pass until `now`; what falls due on the way happens at its own time."""
+        bites = self._fed_ns + self._timeout_ns
+        if self._enabled and now >= bites and len(self._off) < self._plant.dof:
+            self._pass(bites)
+            hint = "no command came within the drive's watchdog; find why the loop fell silent"
+            axes = set(range(self._plant.dof)) - self._off
+            self.fail(sorted(axes), _COMMUNICATION_LOST, "COMMUNICATION_LOST", hint)
+        self._pass(now)
+
+    def _switch_off(self, axes: Iterable[int]) -> None:
+        self._off.update(axes)
+        for axis in axes:
+            self._plant.release(axis)
+
+    def _pass(self, now: int) -> None:
         while self._waiting and self._waiting[0][0] <= now:
             due, command = self._waiting.popleft()
             self._plant.advance(due)
@@ -152,7 +224,25 @@ class SimArm(Arm):
             case CommandMode.DAMP:
                 kp, kd = self._none, self._kd
         velocity = command.velocity if command.mode is CommandMode.TRACK else self._none
-        self._plant.drive_arm(kp, kd, command.position, velocity, command.effort)
+        effort = command.effort
+        if self._off:
+            alive = np.array([axis not in self._off for axis in range(self._plant.dof)], dtype=np.float64)
+            kp, kd, effort = alive * kp, alive * kd, alive * effort
+        self._plant.drive_arm(kp, kd, command.position, velocity, effort)
+
+    def _warm(self, effort: Vector, now: int) -> None:
+        self._warm_ns = now + _WARM_NS
+        for thermal, load in zip(self._thermals, (effort / self._largest).tolist(), strict=True):
+            thermal.step(load, _WARM_NS * 1e-9)
+        self._temperature = frozen([max(thermal.mosfet, thermal.rotor) for thermal in self._thermals])
+
+    def _require_healthy(self) -> None:
+        if self._unpowered:
+            silent = ", ".join(self._names[axis] for axis in sorted(self._unpowered))
+            raise HardwareError(f"no answer from {silent}", "check the supply of the drives")
+        if self._faults:
+            faults = ", ".join(f"{fault.joint} reports {fault.name}" for fault in self._faults)
+            raise HardwareError(faults, f"{self._faults[0].hint}; then clear the fault")
 
     def _require_connected(self) -> None:
         if not self._connected:

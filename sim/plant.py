@@ -17,6 +17,8 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Truth, Vector
 
 PHYSICS_STEP_NS = 1_000_000
+WATCHDOG_SHARE = 0.8
+"""Watchdog timeout of simulated drives, as a fraction of the longest that the profile allows."""
 _BRAKE_TORQUE = 500.0
 """Nm of dry friction that a closed brake adds."""
 _BRAKE_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)

@@ -14,7 +14,8 @@ ALLOWED = {
     "sim": {"sim", "hal"},
     "control": {"control", "safety", "hal"},
     "learning": {"learning", "control", "safety", "hal"},
-    "cli": {"cli", "learning", "control", "safety", "sim", "hal"},
+    "trials": {"trials", "learning", "control", "safety", "sim", "hal"},
+    "cli": {"cli", "trials", "learning", "control", "safety", "sim", "hal"},
 }
 PACKAGES = set(ALLOWED)
 

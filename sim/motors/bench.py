@@ -18,10 +18,7 @@ from robotctl.sim.motors.damiao import FOREVER, DamiaoDrive
 from robotctl.sim.motors.memory import Memory, factory_values
 from robotctl.sim.motors.shaft import Shaft
 from robotctl.sim.motors.trouble import Reply, Trouble
-from robotctl.sim.plant import PHYSICS_STEP_NS, Plant
-
-WATCHDOG_SHARE = 0.8
-"""TIMEOUT in a drive's flash, as a fraction of the longest that the profile allows."""
+from robotctl.sim.plant import PHYSICS_STEP_NS, WATCHDOG_SHARE, Plant
 
 _STEP_S = PHYSICS_STEP_NS * 1e-9
 _WARM_NS = 100_000_000

@@ -4,6 +4,8 @@ Time is the clock's that it was opened with: the plant stands still between two 
 So the same bus runs in real time and in lockstep, and the same calls at the same times give the same answers.
 """
 
+from collections import deque
+
 import can
 
 from robotctl.hal.can.channel import Channel
@@ -21,6 +23,9 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         super().__init__(channel="emulated")
         self.channel_info = "emulated drives"
         self.bench = bench
+        self.failure: Exception | None = None
+        """Raised by every send while it is set: an adapter that was unplugged, a queue that is full."""
+        self._errors: deque[can.Message] = deque()
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._fd = fd
         self._clock = clock
@@ -36,10 +41,16 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
             can.CanOperationError: for a CAN FD frame on a classic bus.
         """
         self._advance(self._now())
+        if self.failure is not None:
+            raise self.failure
         if msg.is_fd and not self._fd:
             raise can.CanOperationError("a CAN FD frame cannot be sent on a classic bus")
         if not (msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame):
             self._receive(msg.arbitration_id, msg.data)
+
+    def report(self, error_class: int, data: bytes = bytes(8)) -> None:
+        """Let the host receive an error frame of its controller, in SocketCAN's terms (linux/can/error.h)."""
+        self._errors.append(can.Message(arbitration_id=error_class, is_error_frame=True, data=data))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the next reply, or None when none comes within `timeout` seconds of the clock; None waits for ever."""
@@ -58,6 +69,8 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         return message
 
     def _pop(self) -> can.Message | None:
+        if self._errors:
+            return self._errors.popleft()
         replies = self._replies
         while replies:
             arbitration_id, data, fd, stamp_ns = replies.popleft()

@@ -12,7 +12,7 @@ class Shaft:
     `scale` holds sign and gear of a joint, or, for a gripper, motor radians per unit of finger travel.
     """
 
-    __slots__ = ("_axis", "_kd", "_kp", "_origin", "_plant", "_runaway", "_scale", "_square", "servo_gains")
+    __slots__ = ("_axis", "_kd", "_kp", "_origin", "_part", "_plant", "_runaway", "_scale", "_square", "servo_gains")
 
     def __init__(self, plant: Plant, axis: int, scale: float, origin: float, kp: float, kd: float) -> None:
         """Take an axis whose drive is off; `kp` and `kd` are the least of its own loop, in axis coordinates."""
@@ -23,6 +23,7 @@ class Shaft:
         self._origin = origin
         self._kp = 0.0
         self._kd = 0.0
+        self._part = 1.0
         self._runaway: float | None = None
         inertia = plant.inertia(axis)
         self.servo_gains = (
@@ -41,14 +42,15 @@ class Shaft:
         """Set the law torque = kp (position - q) + kd (velocity - dq) + effort."""
         if self._runaway is not None:
             return
-        scale = self._scale
+        scale, part = self._scale, self._part
+        square = part * self._square
         self._plant.drive(
             self._axis,
-            kp * self._square,
-            kd * self._square,
+            kp * square,
+            kd * square,
             position / scale + self._origin,
             velocity / scale,
-            effort * scale,
+            part * effort * scale,
         )
         if kp != self._kp or kd != self._kd:
             # The lag filters kp p + kd v + t as one number; with other gains its old state means nothing.
@@ -67,6 +69,15 @@ class Shaft:
     def jam(self, jammed: bool) -> None:
         """Seize up, or run freely again."""
         self._plant.jam(self._axis, jammed)
+
+    @property
+    def is_running_away(self) -> bool:
+        """Whether it turns with a torque of its own."""
+        return self._runaway is not None
+
+    def weaken(self, part: float) -> None:
+        """Apply this part of every torque from the next command on; 1 is all of it."""
+        self._part = part
 
     def run_away(self, effort: float | None) -> None:
         """Turn with this torque, Nm, whatever the drive says, until called with None."""

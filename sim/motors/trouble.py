@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from random import Random
 from typing import NamedTuple
 
-from robotctl.hal.can.damiao.codec import Status
+from robotctl.hal.can.damiao.codec import Status, decode_feedback, encode_feedback, is_feedback
+from robotctl.hal.can.damiao.motors import Ranges
 from robotctl.sim.motors.damiao import FOREVER, DamiaoDrive
 
 
@@ -156,3 +157,46 @@ class Failure(Trouble):
 
     def begin(self, drive: DamiaoDrive) -> None:
         drive.fail(self.status)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misreport(Trouble):
+    """The feedback tells of another angle: an encoder that slipped."""
+
+    offset: float = 1.0
+    """rad of the motor"""
+    ranges: Ranges
+    """The drive's."""
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
+        return [self._shift(reply) for reply in replies]
+
+    def _shift(self, reply: Reply) -> Reply:
+        if self.motor_id is None or not is_feedback(reply.data, self.motor_id):
+            return reply
+        feedback = decode_feedback(reply.data, self.ranges)
+        shifted = feedback._replace(position=feedback.position + self.offset)
+        return reply._replace(data=encode_feedback(shifted, self.ranges))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Short(Trouble):
+    """Replies lose their last bytes."""
+
+    length: int = 6
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
+        return [reply._replace(data=reply.data[: self.length]) for reply in replies]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weak(Trouble):
+    """The drive applies a part of the torque that it should; with a negative part, in the wrong direction."""
+
+    part: float = 0.5
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        drive.shaft.weaken(self.part)
+
+    def end(self, drive: DamiaoDrive) -> None:
+        drive.shaft.weaken(1.0)

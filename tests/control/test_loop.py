@@ -666,6 +666,20 @@ def test_an_arm_is_not_damped_by_where_it_was_once():
     assert not any(drive.enabled for drive in bench.drives)
 
 
+def test_a_joint_that_is_not_heard_of_is_not_pushed_about(bench):
+    """What the integrator sees of it is an error that does not change, whatever it does."""
+    bench.reach(State.ARMED)
+    bench.lead(0.9, 0.5)
+    seen = bench.arm.arm.read()
+    frozen = {key: getattr(seen, key) for key in ("position", "velocity", "joint_stamp_ns")}
+    bench.arm.alter = lambda sample: sample._replace(**frozen)
+    bench.tick(round(0.3 * bench.robot.profile.servo_hz))
+    where = bench.truth.position
+    bench.tick(round(0.3 * bench.robot.profile.servo_hz))
+    assert bench.truth.position == pytest.approx(where, abs=2e-3)
+    assert bench.supervisor.cause.protection.label == "P12"
+
+
 def test_a_reset_routine_brakes_while_a_joint_is_not_heard_of():
     session = LockstepSession(load_robot("panda"), "can")
     session.open()

@@ -91,6 +91,11 @@ class DamiaoArm(Arm):
         if self._transport is not None:
             self._transport.inspector = inspector.frames
 
+    @property
+    def channel(self) -> Channel | None:
+        """The open channel; None before `connect` and after `close`."""
+        return self._channel
+
     # --- life -------------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:

@@ -28,10 +28,13 @@ from robotctl.sim.motors.trouble import (
     Drop,
     Duplicate,
     Failure,
+    Misreport,
     Mute,
     PowerCut,
     Runaway,
+    Short,
     Stuck,
+    Weak,
 )
 
 MS = 1_000_000
@@ -229,3 +232,44 @@ def test_register_presets(desk: Desk) -> None:
 def test_register_presets_that_make_no_sense(desk: Desk, order: str) -> None:
     with pytest.raises(ConfigError):
         order_register(desk.bench, order)
+
+
+def test_misreport_shifts_the_angle_and_nothing_else(desk: Desk) -> None:
+    before = decode_feedback(desk.ask()[0].data, desk.drive.ranges)
+    desk.bench.trouble.add(Misreport(motor_id=MOTOR, offset=0.5, ranges=desk.drive.ranges))
+    after = decode_feedback(desk.ask()[0].data, desk.drive.ranges)
+    assert after.position == pytest.approx(before.position + 0.5, abs=1e-3)
+    assert after._replace(position=before.position) == before
+    request = encode_register(MOTOR, RegisterCommand.READ, Register.PMAX)
+    assert desk.ask(request, BROADCAST_ID)[0].data[2] == RegisterCommand.READ
+
+
+def test_short_replies(desk: Desk) -> None:
+    desk.bench.trouble.add(Short(motor_id=MOTOR, length=5))
+    assert len(desk.ask()[0].data) == 5
+
+
+@pytest.mark.parametrize("part", [0.5, -1.0])
+def test_a_weak_drive_applies_a_part_of_its_torque(desk: Desk, part: float) -> None:
+    desk.ask(encode_special(Special.ENABLE))
+    push = encode_mit(MitCommand(0.0, 0.0, 0.0, 0.0, 2.0), desk.drive.ranges)
+    weak = Weak(motor_id=MOTOR, part=part)
+    desk.bench.trouble.add(weak)
+    desk.ask(push)
+    desk.ask(push)
+    assert desk.drive.shaft.state()[2] == pytest.approx(2.0 * part, abs=0.02)
+    desk.bench.trouble.remove(weak)
+    desk.ask(push)
+    desk.ask(push)
+    assert desk.drive.shaft.state()[2] == pytest.approx(2.0, abs=0.02)
+
+
+def test_a_bus_that_fails_and_one_that_reports_errors(desk: Desk) -> None:
+    desk.bus.report(0x40)
+    frames = desk.ask()
+    assert [frame.is_error_frame for frame in frames] == [True, False]
+    desk.bus.failure = can.CanOperationError("unplugged")
+    with pytest.raises(can.CanOperationError, match="unplugged"):
+        desk.ask()
+    desk.bus.failure = None
+    assert len(desk.ask()) == 1

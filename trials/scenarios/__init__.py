@@ -1,0 +1,11 @@
+"""Every scenario there is, by the protection that it provokes."""
+
+from robotctl.hal.robot import Robot
+from robotctl.trials.scenario import Scenario
+from robotctl.trials.scenarios import limits, measured
+
+
+def scenarios(robot: Robot, backend: str) -> list[Scenario]:
+    """Return the scenarios of a robot on a backend, in the order of the protections."""
+    found = [scenario for module in (limits, measured) for scenario in module.scenarios(robot, backend)]
+    return sorted(found, key=lambda scenario: scenario.number)

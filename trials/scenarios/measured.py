@@ -1,0 +1,153 @@
+"""P3, P5, P12, P17, P24: faults that show in what is measured."""
+
+import numpy as np
+
+from robotctl.hal.robot import Robot
+from robotctl.safety.trip import Category, Protection
+from robotctl.trials.bench import Bench
+from robotctl.trials.clearing import Clears
+from robotctl.trials.faults import (
+    Planted,
+    everywhere,
+    failed,
+    fastest,
+    misread,
+    mute,
+    runaway,
+    stuck,
+    teleported,
+    unpowered,
+    weak,
+)
+from robotctl.trials.policies import velocities
+from robotctl.trials.poses import at_limit, at_sphere
+from robotctl.trials.resuming import resuming_scenario
+from robotctl.trials.scenario import Scenario
+from robotctl.trials.stops import Expected, stop_scenario
+
+_BEYOND = 0.005
+"""rad or m past where a breach begins."""
+_SPRING_S = 3.0
+"""Moved by hand, the arm springs back to where its drives hold it, and swings."""
+_CRASH_REST_S = 1.5
+"""A joint that seizes up under way is a collision: the rest of the arm swings out on the drives' springs."""
+
+
+def _still(bench: Bench) -> None:
+    """Run, but do not move."""
+    bench.start(velocities(lambda _time, position: np.zeros_like(position)))
+    bench.run(0.2)
+
+
+def _at_limit(bench: Bench) -> None:
+    bench.plant.place(at_limit(bench.robot, np.random.default_rng(bench.seed), _BEYOND)[0])
+    bench.tick()
+    _still(bench)
+
+
+def _past_limit(bench: Bench) -> Planted:
+    breach = bench.robot.profile.safety.position_breach
+    pose, _, _ = at_limit(bench.robot, np.random.default_rng(bench.seed), -breach - _BEYOND)
+    return teleported(bench, pose)
+
+
+def _slipped(bench: Bench) -> Planted:
+    breach = bench.robot.profile.safety.position_breach
+    _, joint, outward = at_limit(bench.robot, np.random.default_rng(bench.seed), _BEYOND)
+    return misread(bench, joint, outward * (breach + 3.0 * _BEYOND))
+
+
+def _sphere_poses(bench: Bench) -> tuple[np.ndarray, np.ndarray]:
+    breach = bench.robot.profile.safety.sphere_breach
+    return at_sphere(bench.robot, np.random.default_rng(bench.seed), (-_BEYOND, breach + _BEYOND))
+
+
+def _at_sphere(bench: Bench) -> None:
+    bench.plant.place(_sphere_poses(bench)[0])
+    bench.tick()
+    _still(bench)
+
+
+def _outside_sphere(bench: Bench) -> Planted:
+    return teleported(bench, _sphere_poses(bench)[1])
+
+
+def _some(bench: Bench) -> int:
+    return int(bench.random.integers(bench.robot.dof))
+
+
+def _one_mute(bench: Bench) -> Planted:
+    return mute(bench, [_some(bench)])
+
+
+def _all_mute(bench: Bench) -> Planted:
+    return mute(bench, everywhere(bench))
+
+
+def _taking_turns(bench: Bench) -> Planted:
+    """One joint at a time is heard of, each for as long as is still young."""
+    turn = bench.robot.profile.safety.feedback_fault_s / 2.0
+    showed = False
+    for axis in everywhere(bench):
+        planted = mute(bench, set(everywhere(bench)) - {axis})
+        bench.run(turn)
+        showed |= planted.showed()
+        planted.undo()
+        if bench.trips:
+            break
+    last = mute(bench, everywhere(bench))
+    return Planted(last.undo, lambda: showed)
+
+
+def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
+    safety = robot.profile.safety
+    position = Expected(
+        protection=Protection.POSITION,
+        category=Category.BRAKE_OFF,
+        clears=Clears.RETREAT,
+        excused=frozenset({"position", "velocity"}),
+    )
+    outside = Expected(
+        protection=Protection.SPHERE,
+        category=Category.BRAKE_HOLD,
+        clears=Clears.RETREAT,
+        rest_s=_SPRING_S,
+        excused=frozenset({"sphere", "velocity"}),
+    )
+    silent = Expected(protection=Protection.FEEDBACK, category=Category.BRAKE_OFF, within_s=safety.feedback_fault_s)
+    led_away = Expected(
+        protection=Protection.TRACKING,
+        category=Category.BRAKE_OFF,
+        within_s=0.4,
+        rest_s=_CRASH_REST_S,
+        excused=frozenset({"velocity"}),
+    )
+    return [
+        stop_scenario(3, "past a limit", "a joint is moved past its soft limit", _past_limit, position, _at_limit),
+        stop_scenario(3, "slipped encoder", "a joint is measured past its limit", _slipped, position, _at_limit),
+        stop_scenario(5, "outside", "the arm is moved until its tool is outside", _outside_sphere, outside, _at_sphere),
+        stop_scenario(12, "one mute", "a drive obeys, but is not heard of", _one_mute, silent),
+        stop_scenario(12, "all mute", "no drive is heard of", _all_mute, silent),
+        stop_scenario(12, "taking turns", "one drive at a time is heard of", _taking_turns, silent),
+        stop_scenario(12, "power lost", "a drive loses its supply", lambda b: unpowered(b, [_some(b)]), silent),
+        resuming_scenario(12, "short gap", "no drive is heard of for 30 ms", _all_mute, 0.03),
+        stop_scenario(17, "stuck joint", "the fastest joint seizes up", stuck, led_away),
+        stop_scenario(
+            17, "wrong direction", "a drive pushes the wrong way", lambda b: weak(b, fastest(b), -1.0), led_away
+        ),
+        stop_scenario(17, "half the torque", "a drive applies half its torque", lambda b: weak(b, 1, 0.5), led_away),
+        stop_scenario(
+            17,
+            "runaway",
+            "a drive turns with 30 % of its torque by itself",
+            lambda b: runaway(b, fastest(b), 0.3 * b.robot.limits.torque[fastest(b)]),
+            led_away,
+        ),
+        stop_scenario(
+            24,
+            "drive fault",
+            "a drive reports over-current and goes off",
+            lambda b: failed(b, _some(b)),
+            Expected(protection=Protection.DRIVE, category=Category.BRAKE_OFF, clears=Clears.POWER),
+        ),
+    ]

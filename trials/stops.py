@@ -1,0 +1,143 @@
+"""Scenarios that end in a stop: plant a fault under a moving arm, and hold what follows against what is promised."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robotctl.hal.robot import Robot
+from robotctl.safety.judge import Judge
+from robotctl.safety.machine import State
+from robotctl.safety.trip import Category, Protection
+from robotctl.trials.bench import Bench
+from robotctl.trials.clearing import Clears, go_on
+from robotctl.trials.faults import Fault
+from robotctl.trials.measure import measure_stop
+from robotctl.trials.policies import sway
+from robotctl.trials.scenario import Scenario, Trial
+
+_LEAD_S = 0.4
+_MOMENTS_S = 1.0
+_WATCH_S = 1.0
+"""How long an arm at rest is watched, with its policy still at work, before the operator does something."""
+_DRIFT = 0.02
+"""rad; more is a motion."""
+_SLACK_TICKS = 2
+
+Start = Callable[[Bench], None]
+"""Brings a bench from READY to where the fault is to meet it."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Expected:
+    """What a fault has to end in."""
+
+    protection: Protection
+    category: Category
+    clears: Clears = Clears.ACK
+    within_s: float = 0.0
+    """Longest time from the fault to the first stopping command, beyond two ticks."""
+    rest_s: float | None = None
+    """Longest time from that command to rest, where the fault itself keeps the arm from stopping as it should; else
+    the published one."""
+    excused: frozenset[str] = frozenset()
+    """Invariants that the fault itself breaks: limits as the judge names them, or `drift`."""
+
+    def __str__(self) -> str:
+        name, category = self.protection.label, int(self.category)
+        return f"{name}, category {category}, within {1e3 * self.within_s:.0f} ms; cleared {self.clears.value}"
+
+
+def running(bench: Bench) -> None:
+    """Let a policy swing the arm about, until a moment that the seed chooses."""
+    bench.start(sway(bench))
+    bench.run(_LEAD_S + bench.random.uniform(0.0, _MOMENTS_S))
+
+
+def stop_scenario(
+    number: int,
+    name: str,
+    provoked: str,
+    fault: Fault,
+    expected: Expected,
+    start: Start = running,
+) -> Scenario:
+    """Return the scenario that plants a fault under a moving arm."""
+
+    def run(robot: Robot, backend: str, seed: int) -> Trial:
+        trial = Trial()
+        with Bench(robot, backend, seed) as bench:
+            start(bench)
+            if trial.require(not bench.trips, f"stopped before the fault: {bench.trips}"):
+                _stop(bench, fault, expected, trial)
+        return trial
+
+    return Scenario(number, name, provoked, str(expected), run)
+
+
+def _stop(bench: Bench, fault: Fault, expected: Expected, trial: Trial) -> None:
+    onset = bench.now_ns
+    planted = fault(bench)
+    final = State.HOLD if expected.category is Category.BRAKE_HOLD else State.FAULT
+    bench.until(lambda: bench.state is final, expected.within_s + bench.robot.stopping_time_s + 1.0)
+    bench.run(_WATCH_S)
+    judge_trip(bench.trips, expected, trial)
+    trial.require(bench.state is final, f"ended in {bench.state.name} instead of {final.name}")
+    trial.require(planted.showed(), "the fault did not show: it was not there")
+    judge_stop(bench.robot, bench.since(onset), onset, expected, trial)
+    if not trial.problems:
+        go_on(bench, planted, expected.clears, trial)
+
+
+def judge_trip(trips: Sequence[dict[str, Any]], expected: Expected, trial: Trial) -> None:
+    """Require that the right protection tripped first, in its category."""
+    if trial.require(bool(trips), "nothing tripped"):
+        first = trips[0]
+        trial.seen = f"{first['protection']}, category {first['stop_category']}"
+        right = (first["protection"], first["stop_category"]) == (expected.protection.label, int(expected.category))
+        trial.require(right, f"{trial.seen} came first: {first['text']}")
+
+
+def judge_stop(robot: Robot, records: NDArray[Any], onset_ns: int, expected: Expected, trial: Trial) -> None:
+    """Measure a stop, and require of it what is published.
+
+    Args:
+        robot: that was stopped.
+        records: of the ticks from the onset to well after rest.
+        onset_ns: when the fault began.
+        expected: what it had to end in.
+        trial: takes figures and problems.
+    """
+    stop = measure_stop(records, onset_ns, robot)
+    if stop is None:
+        trial.require(False, "the arm was not stopped")
+        return
+    longest = robot.stopping_time_s if expected.rest_s is None else expected.rest_s
+    reaction = expected.within_s + _SLACK_TICKS * robot.period_ns * 1e-9
+    trial.figures |= {
+        "reaction_s": stop.reaction_s,
+        "standstill_s": stop.standstill_s,
+        "joint_way_rad": stop.joint_way,
+        "tool_way_m": stop.tool_way,
+    }
+    trial.require(
+        stop.reaction_s <= reaction, f"reacted after {1e3 * stop.reaction_s:.1f} ms, not {1e3 * reaction:.1f}"
+    )
+    trial.require(stop.standstill_s <= longest, f"at rest after {stop.standstill_s:.3f} s instead of {longest:.3f} s")
+    if "drift" not in expected.excused:
+        trial.require(stop.drift < _DRIFT, f"moved on by {stop.drift:.3f} rad after it had come to rest")
+    judge_limits(robot, records, expected.excused, trial)
+
+
+def judge_limits(robot: Robot, records: NDArray[Any], excused: frozenset[str], trial: Trial) -> None:
+    """Require that the invariants held, but for those that the fault itself breaks."""
+    judge = Judge(robot)
+    judge.take(records)
+    trial.require(judge.on_truth, "judged on measurements, not on the plant's true state")
+    for key, ticks in judge.violations.items():
+        if np.isfinite(judge.worst[key]):
+            trial.figures[f"{key}_excess"] = float(judge.worst[key])
+        if key not in excused:
+            trial.require(ticks == 0, f"{key} limit exceeded by {judge.worst[key]:.4f} in {ticks} ticks")
