@@ -31,6 +31,7 @@ class Kind(Enum):
 class Asked(NamedTuple):
     """A motion of one joint, in its own coordinates."""
 
+    kind: Kind
     position: float
     """rad"""
     velocity: float
@@ -42,15 +43,24 @@ class Asked(NamedTuple):
     effort: float
     """Nm"""
 
-    @property
-    def kind(self) -> Kind:
-        if self.kp:
-            return Kind.TRACK
-        return Kind.DAMP if self.kd else Kind.TORQUE
+    @staticmethod
+    def of(position: float, velocity: float, kp: float, kd: float, effort: float) -> "Asked":
+        """Return the motion whose kind its gains tell."""
+        kind = Kind.TRACK if kp else Kind.DAMP if kd else Kind.TORQUE
+        return Asked(kind, position, velocity, kp, kd, effort)
 
 
-EXACT = Asked(0.0, 0.0, 0.0, 0.0, 0.0)
-"""As a resolution: nothing was rounded."""
+class Step(NamedTuple):
+    """How far off each field of a motion may be for rounding, in the same units."""
+
+    position: float
+    velocity: float
+    kp: float
+    kd: float
+    effort: float
+
+
+EXACT = Step(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Refusal(NamedTuple):

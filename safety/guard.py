@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample
-from robotctl.safety.asked import EXACT, Asked, Kind, Refusal
+from robotctl.safety.asked import EXACT, Asked, Kind, Refusal, Step
 from robotctl.safety.joint_guard import JointGuard
 from robotctl.safety.machine import ENABLED, State
 from robotctl.safety.trip import Protection
@@ -96,7 +96,7 @@ class Guard:
         still = [0.0] * n
         velocity = command.velocity.tolist() if command.mode is CommandMode.TRACK else still
         fields = zip(command.position.tolist(), velocity, gains, command.effort.tolist(), strict=True)
-        return self._motion([(i, Asked(p, v, kp, kd, t), EXACT) for i, (p, v, (kp, kd), t) in enumerate(fields)])
+        return self._motion([(i, Asked.of(p, v, kp, kd, t), EXACT) for i, (p, v, (kp, kd), t) in enumerate(fields)])
 
     def frames(self, frames: Sequence[tuple[int, bytes]]) -> str:
         motions = []
@@ -122,15 +122,15 @@ class Guard:
             return ""
         return self._refuse(Refusal(Protection.FRAMES, f"{kind.name} is not permitted in state {state.name}"))
 
-    def _motion(self, motions: Sequence[tuple[int, Asked, Asked]]) -> str:
+    def _motion(self, motions: Sequence[tuple[int, Asked, Step]]) -> str:
         """Judge what joints (index, motion, resolution) are asked together; all of it leaves, or nothing."""
-        standing = self._state() in _STANDING
+        state = self._state()
+        standing = state in _STANDING
         seconds = self._time_ns * 1e-9
         power = 0.0
         for index, asked, step in motions:
-            refused = self._permit(asked.kind)
-            if refused:
-                return refused
+            if state not in PERMITTED[asked.kind]:
+                return self._permit(asked.kind)
             self._cycles[index] += 1
             if self._cycles[index] > self._most:
                 return self._refuse(Refusal(Protection.FRAMES, f"more than {self._most} motions within 0.25 s"))

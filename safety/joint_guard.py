@@ -3,11 +3,13 @@
 import math
 
 from robotctl.hal.profile import Joint, Safety
-from robotctl.safety.asked import Asked, Kind, Refusal
+from robotctl.safety.asked import Asked, Kind, Refusal, Step
 from robotctl.safety.trip import Protection
 
 _ROUNDING = 1.001
 """Room for floating point: a limit passed by less is no finding."""
+_NUMERIC = 1e-6
+"""The same for the place of a stop, rad."""
 _LEAST_DAMPING = 0.5
 """Nms/rad of the motor with which a drive may damp, whatever its tracking gain: it may have to stop a falling arm."""
 
@@ -42,49 +44,49 @@ class JointGuard:
         self._last = asked
 
     def refuse(
-        self, asked: Asked, step: Asked, position: float, velocity: float, seconds: float, *, standing: bool
+        self, asked: Asked, step: Step, position: float, velocity: float, seconds: float, *, standing: bool
     ) -> Refusal | None:
         """Return why a message may not leave, or None.
 
         Args:
             asked: what it asks.
-            step: its resolution: how far off each value may be for rounding.
+            step: what rounding may have cost it.
             position: measured, rad.
             velocity: measured, rad/s.
             seconds: wall time there was for the change since the last message.
             standing: whether the arm is to stand still.
         """
-        if not math.isfinite(sum(asked)):
+        kind, target, speed, kp, kd, effort = asked
+        if not math.isfinite(target + speed + kp + kd + effort):
             return self._refusal(Protection.FRAMES, "a value that is no number")
-        if asked.kp > self._kp + step.kp or asked.kd > self._kd + step.kd:
-            return self._refusal(Protection.FRAMES, f"gains {asked.kp:.1f} and {asked.kd:.2f}, above the profile's")
-        if abs(asked.effort) > self._effort + step.effort:
-            return self._refusal(Protection.TORQUE, f"{asked.effort:.2f} Nm, above its torque cap")
-        if asked.kind is Kind.DAMP:
+        if kp > self._kp + step.kp or kd > self._kd + step.kd:
+            return self._refusal(Protection.FRAMES, f"gains {kp:.1f} and {kd:.2f}, above the profile's")
+        if abs(effort) > self._effort + step.effort:
+            return self._refusal(Protection.TORQUE, f"{effort:.2f} Nm, above its torque cap")
+        if kind is Kind.DAMP:
             # The last resort of an arm without brakes: its torque comes at once.
-            moves = abs(asked.velocity) > step.velocity
-            return self._refusal(Protection.FRAMES, "damping towards a motion") if moves else None
+            return self._refusal(Protection.FRAMES, "damping towards a motion") if abs(speed) > step.velocity else None
         last = self._last
         # A tracking drive makes its torque itself; what comes on top jumps when full braking sets in.
-        once = 2.0 * step.effort + (self._effort_step if asked.kind is Kind.TRACK else 0.0)
-        if last is not None and abs(asked.effort - last.effort) > self._effort_rate * seconds + once:
-            return self._refusal(Protection.TORQUE, f"{asked.effort - last.effort:+.2f} Nm at once, above its rate cap")
-        if asked.kind is Kind.TORQUE:
+        once = 2.0 * step.effort + (self._effort_step if kind is Kind.TRACK else 0.0)
+        if last is not None and abs(effort - last.effort) > self._effort_rate * seconds + once:
+            return self._refusal(Protection.TORQUE, f"{effort - last.effort:+.2f} Nm at once, above its rate cap")
+        if kind is Kind.TORQUE:
             return None
-        if standing and abs(asked.velocity) > self._standstill + step.velocity:
-            return self._refusal(Protection.FRAMES, f"{asked.velocity:.3f} rad/s, while the arm is to stand still")
-        if abs(asked.velocity) > self._velocity + step.velocity:
-            return self._refusal(Protection.VELOCITY, f"{asked.velocity:.3f} rad/s, above its velocity cap")
+        if standing and abs(speed) > self._standstill + step.velocity:
+            return self._refusal(Protection.FRAMES, f"{speed:.3f} rad/s, while the arm is to stand still")
+        if abs(speed) > self._velocity + step.velocity:
+            return self._refusal(Protection.VELOCITY, f"{speed:.3f} rad/s, above its velocity cap")
         if last is None or last.kind is not Kind.TRACK:
             return self._refuse_start(asked, step, position, velocity, seconds)
-        if abs(asked.position - last.position) > self._velocity * seconds + 2.0 * step.position:
-            return self._refusal(Protection.VELOCITY, f"{asked.position - last.position:+.4f} rad at once")
-        if abs(asked.velocity - last.velocity) > self._acceleration * seconds + 2.0 * step.velocity:
-            return self._refusal(Protection.ACCELERATION, f"{asked.velocity - last.velocity:+.3f} rad/s at once")
-        return self._refuse_stop(asked, step, self._stop_excess(last.position, last.velocity))
+        if abs(target - last.position) > self._velocity * seconds + 2.0 * step.position:
+            return self._refusal(Protection.VELOCITY, f"{target - last.position:+.4f} rad at once")
+        if abs(speed - last.velocity) > self._acceleration * seconds + 2.0 * step.velocity:
+            return self._refusal(Protection.ACCELERATION, f"{speed - last.velocity:+.3f} rad/s at once")
+        return self._refuse_stop(asked, step, last.position, last.velocity)
 
     def _refuse_start(
-        self, asked: Asked, step: Asked, position: float, velocity: float, seconds: float
+        self, asked: Asked, step: Step, position: float, velocity: float, seconds: float
     ) -> Refusal | None:
         """Judge the first message that leads a joint: it has to begin where the joint is, as it moves.
 
@@ -97,13 +99,15 @@ class JointGuard:
         jump = abs(asked.velocity - max(-self._velocity, min(velocity, self._velocity)))
         if not jump <= self._acceleration * seconds + self._tolerance + step.velocity:
             return self._refusal(Protection.BUMP, f"start at {asked.velocity:.3f} rad/s, measured {velocity:.3f}")
-        return self._refuse_stop(asked, step, self._stop_excess(position, velocity))
+        return self._refuse_stop(asked, step, position, velocity)
 
-    def _refuse_stop(self, asked: Asked, step: Asked, before: float) -> Refusal | None:
-        """Refuse a motion whose braking ends past a soft limit, unless it only gets better."""
+    def _refuse_stop(self, asked: Asked, step: Step, position: float, velocity: float) -> Refusal | None:
+        """Refuse a motion whose braking ends past a soft limit, and further out than from where it comes."""
+        excess = self._stop_excess(asked.position, asked.velocity)
+        if excess <= 0.0:
+            return None
         rounding = step.position + step.velocity * (abs(asked.velocity) + step.velocity) / self._braking
-        allowed = max(before, 0.0) + 2.0 * rounding + 1e-6
-        if self._stop_excess(asked.position, asked.velocity) > allowed:
+        if excess > max(self._stop_excess(position, velocity), 0.0) + 2.0 * rounding + _NUMERIC:
             return self._refusal(Protection.SOFT_LIMIT, f"{asked.position:.3f} rad at {asked.velocity:.3f} rad/s")
         return None
 

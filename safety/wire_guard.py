@@ -9,13 +9,12 @@ from robotctl.hal.can.damiao.codec import (
     Offset,
     RegisterCommand,
     Special,
-    decode_mit,
     decode_pos_force,
 )
 from robotctl.hal.can.damiao.motors import MOTORS
 from robotctl.hal.can.damiao.registers import Register
 from robotctl.hal.profile import Drive, GripperProfile, RobotProfile
-from robotctl.safety.asked import Asked, Kind
+from robotctl.safety.asked import Asked, Kind, Step
 
 _SPECIALS: dict[int, Kind] = {
     Special.ENABLE: Kind.ENABLE,
@@ -29,31 +28,34 @@ _HALF = 0.5005
 
 
 class WireJoint:
-    """One motor of the arm: its frames in joint coordinates."""
+    """One motor of the arm: its motion frames in joint coordinates."""
 
     def __init__(self, drive: Drive) -> None:
-        self.ranges = ranges = MOTORS[drive.motor]
-        self._scale = scale = drive.sign * drive.gear
-        self._offset = drive.offset
-        self._turn = 2.0 * math.pi / drive.gear
-        self._square = square = scale * scale
-        self.step = Asked(
-            _HALF * 2.0 * ranges.pmax / 0xFFFF / drive.gear,
-            _HALF * 2.0 * ranges.vmax / 0xFFF / drive.gear,
-            _HALF * KP_MAX / 0xFFF * square,
-            _HALF * KD_MAX / 0xFFF * square,
-            _HALF * 2.0 * ranges.tmax / 0xFFF * drive.gear,
-        )
-        """What rounding may cost each field."""
+        pmax, vmax, tmax = MOTORS[drive.motor]
+        gear, square = drive.gear, drive.gear**2
+        scale = drive.sign * gear
+        self._turn = 2.0 * math.pi / gear
+        # value = raw number * slope + intercept, for each field from the left
+        self._position = (2.0 * pmax / 0xFFFF / scale, drive.offset - pmax / scale)
+        self._velocity = (2.0 * vmax / 0xFFF / scale, -vmax / scale)
+        self._kp = KP_MAX / 0xFFF * square
+        self._kd = KD_MAX / 0xFFF * square
+        self._effort = (2.0 * tmax / 0xFFF * scale, -tmax * scale)
+        slopes = (self._position[0], self._velocity[0], self._kp, self._kd, self._effort[0])
+        self.step = Step(*(_HALF * abs(slope) for slope in slopes))
 
     def asked(self, data: bytes, measured: float) -> Asked:
         """Return what a motion frame asks. Of the turns that a single-turn encoder leaves open, the measured one."""
-        position, velocity, kp, kd, effort = decode_mit(data, self.ranges)
-        scale, square = self._scale, self._square
-        angle = position / scale + self._offset
-        if abs(measured - angle) > 0.5 * self._turn:
-            angle += math.copysign(self._turn, measured - angle)
-        return Asked(angle, velocity / scale, kp * square, kd * square, effort * scale)
+        word = int.from_bytes(data, "big")
+        slope, intercept = self._position
+        position = (word >> 48) * slope + intercept
+        if abs(measured - position) > 0.5 * self._turn:
+            position += math.copysign(self._turn, measured - position)
+        slope, intercept = self._velocity
+        velocity = (word >> 36 & 0xFFF) * slope + intercept
+        slope, intercept = self._effort
+        effort = (word & 0xFFF) * slope + intercept
+        return Asked.of(position, velocity, (word >> 24 & 0xFFF) * self._kp, (word >> 12 & 0xFFF) * self._kd, effort)
 
 
 class WireGripper:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robotctl.hal.robot import load_robot
-from robotctl.safety.asked import EXACT, Asked, Kind
+from robotctl.safety.asked import EXACT, Asked, Kind, Step
 from robotctl.safety.joint_guard import JointGuard
 from robotctl.safety.trip import Protection
 
@@ -18,13 +18,13 @@ KP, KD = JOINT.gains.kp, JOINT.gains.kd
 DT = 2e-3
 LOWER, UPPER = JOINT.position
 BRAKING = (1.0 - SAFETY.cap_margin) * JOINT.acceleration
-STEP = Asked(1e-4, 1e-2, 0.1, 1e-3, 0.05)
+STEP = Step(1e-4, 1e-2, 0.1, 1e-3, 0.05)
 GRID = [-0.1, -0.01, -0.002, 0.002, 0.01, 0.1]
 """Shares of a limit; the guard leaves one in a thousand to rounding."""
 
 
 def track(position=0.0, velocity=0.0, effort=0.0, kp=KP, kd=KD):
-    return Asked(position, velocity, kp, kd, effort)
+    return Asked.of(position, velocity, kp, kd, effort)
 
 
 def guard(last=None):
@@ -44,7 +44,7 @@ def test_what_follows_the_last_message_passes():
     assert ask(guard(), track()) is None
 
 
-@pytest.mark.parametrize("field", Asked._fields)
+@pytest.mark.parametrize("field", Step._fields)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_what_is_no_number_is_refused(field, value):
     assert ask(guard(track()), track()._replace(**{field: value})) is Protection.FRAMES
@@ -60,14 +60,14 @@ def test_gains_above_the_profiles_are_refused(step, resolution):
 def test_damping_may_exceed_a_small_tracking_gain():
     light = ROBOT.profile.joints[6].model_copy(update={"gains": JOINT.gains.model_copy(update={"kd": 0.1})})
     joint = JointGuard(light, SAFETY)
-    assert ask(joint, Asked(0.0, 0.0, 0.0, 0.5, 0.0)) is None
-    assert ask(joint, Asked(0.0, 0.0, 0.0, 0.51, 0.0)) is Protection.FRAMES
+    assert ask(joint, Asked.of(0.0, 0.0, 0.0, 0.5, 0.0)) is None
+    assert ask(joint, Asked.of(0.0, 0.0, 0.0, 0.51, 0.0)) is Protection.FRAMES
     geared = light.model_copy(update={"drive": light.drive.model_copy(update={"gear": 2.0})})
-    assert ask(JointGuard(geared, SAFETY), Asked(0.0, 0.0, 0.0, 2.0, 0.0)) is None
-    assert ask(JointGuard(geared, SAFETY), Asked(0.0, 0.0, 0.0, 2.01, 0.0)) is Protection.FRAMES
+    assert ask(JointGuard(geared, SAFETY), Asked.of(0.0, 0.0, 0.0, 2.0, 0.0)) is None
+    assert ask(JointGuard(geared, SAFETY), Asked.of(0.0, 0.0, 0.0, 2.01, 0.0)) is Protection.FRAMES
     without = light.model_copy(update={"drive": None})
-    assert ask(JointGuard(without, SAFETY), Asked(0.0, 0.0, 0.0, 0.1, 0.0)) is None
-    assert ask(JointGuard(without, SAFETY), Asked(0.0, 0.0, 0.0, 0.11, 0.0)) is Protection.FRAMES
+    assert ask(JointGuard(without, SAFETY), Asked.of(0.0, 0.0, 0.0, 0.1, 0.0)) is None
+    assert ask(JointGuard(without, SAFETY), Asked.of(0.0, 0.0, 0.0, 0.11, 0.0)) is Protection.FRAMES
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -76,7 +76,7 @@ def test_damping_may_exceed_a_small_tracking_gain():
 @pytest.mark.parametrize("gains", [(KP, KD), (0.0, KD), (0.0, 0.0)])
 def test_torque_above_the_cap_is_refused_in_every_mode(side, step, resolution, gains):
     effort = side * (JOINT.torque * (1.0 + step) + resolution.effort)
-    asked = Asked(0.0, 0.0, *gains, effort)
+    asked = Asked.of(0.0, 0.0, *gains, effort)
     assert ask(guard(asked._replace(effort=side * JOINT.torque)), asked, resolution, seconds=1.0) is (
         Protection.TORQUE if step > 0.0 else None
     )
@@ -88,7 +88,7 @@ def test_torque_above_the_cap_is_refused_in_every_mode(side, step, resolution, g
 @pytest.mark.parametrize("seconds", [DT, 3 * DT])
 def test_torque_changes_no_faster_than_its_rate(side, step, resolution, seconds):
     change = side * (JOINT.torque_rate * seconds * (1.0 + step) + 2.0 * resolution.effort)
-    asked = Asked(0.0, 0.0, 0.0, 0.0, 5.0 + change)
+    asked = Asked.of(0.0, 0.0, 0.0, 0.0, 5.0 + change)
     assert ask(guard(asked._replace(effort=5.0)), asked, resolution, seconds=seconds) is (
         Protection.TORQUE if step > 0.0 else None
     )
@@ -104,18 +104,18 @@ def test_feed_forward_may_jump_when_braking_sets_in_and_no_further(side, step):
 
 
 def test_damping_takes_its_torque_at_once():
-    assert ask(guard(track(effort=-80.0)), Asked(0.0, 0.0, 0.0, KD, 80.0)) is None
+    assert ask(guard(track(effort=-80.0)), Asked.of(0.0, 0.0, 0.0, KD, 80.0)) is None
 
 
 @pytest.mark.parametrize(
     ("velocity", "refused"), [(0.0, False), (0.0099, False), (-0.0099, False), (0.0101, True), (-1.0, True)]
 )
 def test_damping_leads_nowhere(velocity, refused):
-    assert ask(guard(track()), Asked(0.0, velocity, 0.0, KD, 0.0), STEP) is (Protection.FRAMES if refused else None)
+    assert ask(guard(track()), Asked.of(0.0, velocity, 0.0, KD, 0.0), STEP) is (Protection.FRAMES if refused else None)
 
 
 def test_torque_is_not_judged_by_fields_that_have_no_effect():
-    assert ask(guard(track()), Asked(99.0, 99.0, 0.0, 0.0, 0.0), standing=True) is None
+    assert ask(guard(track()), Asked.of(99.0, 99.0, 0.0, 0.0, 0.0), standing=True) is None
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -194,7 +194,7 @@ def test_outside_a_limit_only_the_way_back_is_allowed(side, limit):
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("step", GRID)
 @pytest.mark.parametrize("resolution", [EXACT, STEP])
-@pytest.mark.parametrize("last", [None, Asked(0.0, 0.0, 0.0, 0.0, 0.0), Asked(0.0, 0.0, 0.0, KD, 0.0)])
+@pytest.mark.parametrize("last", [None, Asked.of(0.0, 0.0, 0.0, 0.0, 0.0), Asked.of(0.0, 0.0, 0.0, KD, 0.0)])
 def test_the_first_message_begins_where_the_joint_is(side, step, resolution, last):
     way = side * ((SAFETY.bump + JOINT.velocity * DT) * (1.0 + step) + resolution.position)
     assert ask(guard(last), track(0.3 + way), resolution, position=0.3) is (Protection.BUMP if step > 0.0 else None)
@@ -259,6 +259,6 @@ def test_whatever_is_let_through_can_be_stopped_inside_the_limits(shares):
 
 def test_kinds():
     assert track().kind is Kind.TRACK
-    assert Asked(0.0, 0.0, 0.0, 1.0, 0.0).kind is Kind.DAMP
-    assert Asked(0.0, 0.0, 0.0, 0.0, 1.0).kind is Kind.TORQUE
+    assert Asked.of(0.0, 0.0, 0.0, 1.0, 0.0).kind is Kind.DAMP
+    assert Asked.of(0.0, 0.0, 0.0, 0.0, 1.0).kind is Kind.TORQUE
     assert np.all(np.array(EXACT) == 0.0)

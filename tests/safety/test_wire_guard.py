@@ -46,7 +46,7 @@ def test_every_joint_is_read_back_in_its_own_coordinates(robot):
         assert wire.kind(drive.id, data) == index
         step = wire.joints[index].step
         asked = wire.joints[index].asked(data, position)
-        for value, wanted, off in zip(asked, (position, velocity, kp, kd, effort), step, strict=True):
+        for value, wanted, off in zip(asked[1:], (position, velocity, kp, kd, effort), step, strict=True):
             assert abs(value - wanted) <= off
 
 
@@ -63,7 +63,7 @@ def test_gears_and_signs_are_the_profiles():
     profile = PANDA.profile.model_copy(update={"joints": [joint.model_copy(update={"drive": drive})]})
     geared = WireGuard(profile).joints[0]
     asked = geared.asked(encode_mit(MitCommand(1.0, 2.0, 3.0, 0.5, 4.0), MOTORS["DM4340"]), 0.0)
-    for value, wanted, off in zip(asked, (0.0, -1.0, 12.0, 2.0, -8.0), geared.step, strict=True):
+    for value, wanted, off in zip(asked[1:], (0.0, -1.0, 12.0, 2.0, -8.0), geared.step, strict=True):
         assert abs(value - wanted) <= off
     assert geared.step == pytest.approx(
         (12.5 / 65535 / 2, 10.0 / 4095 / 2, 1000.0 / 4095, 10.0 / 4095, 56.0 / 4095), rel=2e-3
