@@ -131,7 +131,7 @@ class Supervisor:
 
     def screen(self, sample: Sample) -> Sample:
         """Return what can be believed of a sample. Comes before everything else that looks at it."""
-        if self.state not in ENABLED:
+        if self.state in _AT_REST:
             self._believable.forget()
         return self._believable.screen(sample)
 
@@ -242,6 +242,8 @@ class Supervisor:
                 self.handle(Event.CLEARED)
 
 
+_AT_REST = (State.OFF, State.SILENT, State.READY)
+"""Drives are off and may be moved or woken up a turn away; in DISABLED and FAULT they may still be damped."""
 _SOFT_TRIPPABLE = (State.ARMED, State.RUN, State.RESET)
 _MOVING = (State.RUN, State.RESET)
 _LISTENING = (State.RUN, State.STOPPING, State.HOLD)
