@@ -1,15 +1,19 @@
 """Fixtures that every folder shares."""
 
+import functools
+
 import pytest
 
 from robotctl.hal.robot import Robot, load_robot, robot_names
 
+_load = functools.cache(load_robot)  # robots are immutable
+
 
 @pytest.fixture(params=robot_names())
 def robot(request: pytest.FixtureRequest) -> Robot:
-    return load_robot(request.param)
+    return _load(request.param)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def panda() -> Robot:
-    return load_robot("panda")
+    return _load("panda")
