@@ -9,8 +9,8 @@ PIP := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/pyt
 run: .venv/run ## reach three targets on the twin
 	$(BIN)/robotctl run --backend sim
 
-test: check ## everything that must pass
-	$(BIN)/python -m pytest -q -n 2 -m "not realtime"
+test: check coverage ## everything that must pass
+	$(BIN)/python -m pytest -q -n 2 -m "not realtime" --ignore=tests/safety
 	$(BIN)/python -m pytest -q -m realtime
 
 coverage: .venv/dev ## every branch of safety/ is taken by its own tests

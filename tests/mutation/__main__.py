@@ -5,11 +5,9 @@ tests fail on the unchanged modules or the command line is wrong.
 """
 
 import argparse
-import json
 import os
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 
 # Threads of a linear algebra library do not survive a fork.
@@ -25,8 +23,8 @@ import ruckig  # noqa: F401
 import robotctl.hal.robot  # noqa: F401
 
 from . import campaign
-from .campaign import FATES, NOT_COVERED, SURVIVED, Case, Package
-from .excused import EXCUSED, MOST, Excuse
+from .campaign import Case, Package, Survey
+from .report import EXCUSED, report
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,7 +51,7 @@ def main() -> int:
         for case in campaign.run(package, seen, todo, options.jobs):
             done.append(case)
             if sys.stderr.isatty():
-                print(f"\r{len(done)} of {len(todo)}", end="\r", file=sys.stderr)
+                print(f"{len(done)} of {len(todo)}", end="\r", file=sys.stderr)
     except campaign.UnmutatedTestsFail:
         print("the tests fail on the unchanged modules; look with: python -m pytest tests/safety", file=sys.stderr)
         return 2
@@ -61,7 +59,7 @@ def main() -> int:
     return report(done, excuses, time.monotonic() - began, options.json)
 
 
-def show_one(package: Package, seen: campaign.Survey, todo: list[Case], wanted: str) -> int:
+def show_one(package: Package, seen: Survey, todo: list[Case], wanted: str) -> int:
     for case in todo:
         if case.id == wanted:
             print(f"{case.id}  {case.source}\n    {case.mutant.operator}: {case.mutant.change}", flush=True)
@@ -69,36 +67,6 @@ def show_one(package: Package, seen: campaign.Survey, todo: list[Case], wanted: 
             return 0
     print(f"no mutant {wanted}; there are {' '.join(case.id for case in todo)}", file=sys.stderr)
     return 2
-
-
-def report(done: list[Case], excuses: list[Excuse], seconds: float, path: Path | None) -> int:
-    """Print the figures and what survived; return the exit status."""
-    unused = set(excuses)
-    survivors = []
-    for case in sorted(done, key=lambda case: (case.file, case.mutant.line, case.id)):
-        if case.fate not in (SURVIVED, NOT_COVERED):
-            continue
-        excuse = next((e for e in excuses if e[:3] == (case.file, case.source, case.mutant.change)), None)
-        unused.discard(excuse)
-        survivors.append((case, excuse))
-        label = case.fate if excuse is None else f"excused: {excuse.reason}"
-        print(f"{case.id}  {case.source}\n    {case.mutant.operator}: {case.mutant.change}  ({label})")
-    for excuse in unused:
-        print(f"excused, but there is no such survivor any more: {excuse.file}: {excuse.change}")
-    if len(EXCUSED) > MOST:
-        print(f"{len(EXCUSED)} survivors are excused; no more than {MOST} may be")
-    fates = Counter(case.fate for case in done)
-    excused = sum(excuse is not None for _, excuse in survivors)
-    figures = {"mutants": len(done), **{fate: fates[fate] for fate in FATES}, "excused": excused, "seconds": seconds}
-    print(", ".join(f"{value:.0f} {name}" for name, value in figures.items()))
-    if path is not None:
-        listed = [
-            {"id": case.id, "fate": case.fate, "source": case.source, "operator": case.mutant.operator}
-            | {"change": case.mutant.change, "excuse": excuse and excuse.reason}
-            for case, excuse in survivors
-        ]
-        path.write_text(json.dumps({**figures, "survivors": listed}, indent=2) + "\n")
-    return 1 if len(survivors) > excused or unused or len(EXCUSED) > MOST else 0
 
 
 if __name__ == "__main__":

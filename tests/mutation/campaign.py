@@ -277,21 +277,21 @@ class _Stopwatch:
 
 
 def _import_from_trees(package: Package, trees: dict[str, ast.Module]) -> None:
-    """Let imports of these files compile the trees instead."""
-    sources = {package.module(file): (str((package.folder / file).resolve()), tree) for file, tree in trees.items()}
+    """Let imports of these files take their code from the trees instead."""
+    paths = {package.module(file): str((package.folder / file).resolve()) for file in trees}
+    codes = {package.module(file): compile(trees[file], paths[package.module(file)], "exec") for file in trees}
 
     class Loader(importlib.machinery.SourceFileLoader):
         def get_code(self, fullname: str) -> Any:
-            path, tree = sources[fullname]
-            return compile(tree, path, "exec", dont_inherit=True)
+            return codes[fullname]
 
     class Finder(importlib.machinery.PathFinder):
         @classmethod
         def find_spec(cls, fullname: str, path: Any = None, target: Any = None) -> Any:
-            if fullname not in sources:
+            if fullname not in codes:
                 return None
-            path, _ = sources[fullname]
-            return importlib.util.spec_from_file_location(fullname, path, loader=Loader(fullname, path))
+            loader = Loader(fullname, paths[fullname])
+            return importlib.util.spec_from_file_location(fullname, paths[fullname], loader=loader)
 
-    assert not set(sources) & set(sys.modules), "a module was imported before it could be mutated"
+    assert not set(codes) & set(sys.modules), "imported before it could be mutated"
     sys.meta_path.insert(0, Finder)

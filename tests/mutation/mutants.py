@@ -191,7 +191,7 @@ def _changes(node: Any, field: str, *, table: bool) -> Iterator[Change]:
             yield Change("return", ast.Return(ast.Constant(None)))
         case ast.MatchOr(patterns=patterns):
             for item, rest in _each_left_out(patterns):
-                yield Change("table", altered(patterns=rest), item)
+                yield Change("table", altered(patterns=rest) if len(rest) > 1 else rest[0], item)
         case ast.Tuple(elts=elements, ctx=ast.Load()) | ast.List(elts=elements) | ast.Set(elts=elements) if table:
             for item, rest in _each_left_out(elements):
                 yield Change("table", altered(elts=rest), item)
