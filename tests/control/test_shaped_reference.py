@@ -9,12 +9,12 @@ from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip, Shaper
 
-from ..keep_outs import keep_outs
-
 
 @pytest.mark.parametrize("policy", ["random", "outward", "bang"])
 @pytest.mark.parametrize(("sphere", "furnished"), [("qp", False), ("projection", False), ("qp", True)])
-def test_hostile_wishes_keep_every_invariant(robot: Robot, policy: str, sphere: str, furnished: bool) -> None:
+def test_hostile_wishes_keep_every_invariant(
+    robot: Robot, policy: str, sphere: str, furnished: bool, keep_outs
+) -> None:
     settings = [keep_outs(robot)] if furnished else []
     robot = load_robot(robot.profile.name, [f"safety.sphere={sphere}", *settings])
     kinematics = Kinematics(robot)

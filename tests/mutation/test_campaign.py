@@ -91,7 +91,11 @@ def test_tests_that_fail_anyway_kill_nothing(tmp_path):
 
 def a_case(fate, change="1 -> 2"):
     return Case(
-        f"gate.py:7#{change[-1]}", "gate.py", "return 1", Mutant("number", 7, change, None, None, None, "", None, None), fate
+        f"gate.py:7#{change[-1]}",
+        "gate.py",
+        "return 1",
+        Mutant("number", 7, change, None, None, None, "", None, None),
+        fate,
     )
 
 

@@ -8,9 +8,7 @@ from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.region import Row, regions
 from robotctl.safety.shaper import Clip, Shaper
 
-from ..keep_outs import keep_outs
-
-STATES = 200
+STATES = 100
 
 
 def without_acceleration_caps(robot: Robot) -> list[str]:
@@ -83,14 +81,14 @@ def test_random_states_at_the_surface_and_twice_the_cap(robot: Robot) -> None:
     assert braked < 0.01 * STATES
 
 
-def test_random_states_between_a_table_and_a_box(robot: Robot) -> None:
+def test_random_states_between_a_table_and_a_box(robot: Robot, keep_outs) -> None:
     """Several rows at once: the nearest velocity that keeps all of them."""
     robot = load_robot(robot.profile.name, [keep_outs(robot), *without_acceleration_caps(robot)])
     kinematics = Kinematics(robot)
     shaper = Shaper(robot, kinematics)
     rng, rest, home = np.random.default_rng(6), np.zeros(robot.dof), np.array(robot.profile.home)
     states = several = 0
-    while states < 150:
+    while states < 40:
         pose = np.clip(home + rng.uniform(-0.8, 0.8, robot.dof), robot.limits.lower + 0.1, robot.limits.upper - 0.1)
         tool, jacobian = kinematics.tool_and_jacobian(pose)
         rooms = sorted(region.room(tool) for region in shaper.regions)
@@ -108,7 +106,7 @@ def test_random_states_between_a_table_and_a_box(robot: Robot) -> None:
         assert bool(clip & Clip.KEEP_OUT) is any(
             row.normal @ np.clip(wanted, *shaper._box(pose, rest)) > row.bound for row in rows[1:]
         )
-    assert several > 5
+    assert several > 1
 
 
 def test_the_projection_rule_is_wrong_where_it_is_said_to_be(panda: Robot) -> None:
