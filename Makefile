@@ -4,14 +4,21 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install -qq
 
-.PHONY: run test check format bench clean
+.PHONY: run test check coverage mutation format bench clean
 
 run: .venv/run ## reach three targets on the twin
 	$(BIN)/robotctl run --backend sim
 
-test: check ## everything that must pass
-	$(BIN)/python -m pytest -q -n 2 -m "not realtime"
+test: check coverage ## everything that must pass
+	$(BIN)/python -m pytest -q -n 2 -m "not realtime" --ignore=tests/safety
 	$(BIN)/python -m pytest -q -m realtime
+
+coverage: .venv/dev ## every branch of safety/ is taken by its own tests
+	$(BIN)/python -m coverage run --source=safety -m pytest -q tests/safety
+	$(BIN)/python -m coverage report --show-missing --skip-covered --fail-under=100
+
+mutation: .venv/dev ## every small mistake in safety/ is noticed by its own tests
+	$(BIN)/python -m tests.mutation
 
 check: .venv/dev ## format, lint, types
 	$(BIN)/ruff format --check --diff .

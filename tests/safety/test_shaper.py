@@ -1,24 +1,14 @@
-"""The shaper: one step, boundary grids, and long hostile runs on the reference."""
+"""The shaper, step by step and on boundary grids; tests/control/test_shaped_reference.py has the long hostile runs."""
 
 import numpy as np
 import pytest
 
 from robotctl.control.kinematics import Kinematics
-from robotctl.control.limiter import VelocityLimiter
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.region import Row, regions
 from robotctl.safety.shaper import Clip, Shaper
 
-STATES = 2000
-
-
-def keep_outs(robot: Robot) -> str:
-    """The setting for a table under home, and a turned box beside it."""
-    home = Kinematics(robot).tool(np.array(robot.profile.home))
-    box = [round(float(value), 4) for value in home + np.array([0.02, 0.13, 0.0])]
-    table = f"{{kind: plane, name: table, point: [0, 0, {home[2] - 0.06:.4f}], normal: [0, 0, 1]}}"
-    post = f"{{kind: box, name: post, centre: {box}, half: [0.05, 0.06, 0.2], rpy: [0.2, 0, 0.7], clearance: 0.01}}"
-    return f"keep_out=[{table}, {post}]"
+STATES = 100
 
 
 def without_acceleration_caps(robot: Robot) -> list[str]:
@@ -91,14 +81,14 @@ def test_random_states_at_the_surface_and_twice_the_cap(robot: Robot) -> None:
     assert braked < 0.01 * STATES
 
 
-def test_random_states_between_a_table_and_a_box(robot: Robot) -> None:
+def test_random_states_between_a_table_and_a_box(robot: Robot, keep_outs) -> None:
     """Several rows at once: the nearest velocity that keeps all of them."""
     robot = load_robot(robot.profile.name, [keep_outs(robot), *without_acceleration_caps(robot)])
     kinematics = Kinematics(robot)
     shaper = Shaper(robot, kinematics)
     rng, rest, home = np.random.default_rng(6), np.zeros(robot.dof), np.array(robot.profile.home)
     states = several = 0
-    while states < 150:
+    while states < 40:
         pose = np.clip(home + rng.uniform(-0.8, 0.8, robot.dof), robot.limits.lower + 0.1, robot.limits.upper - 0.1)
         tool, jacobian = kinematics.tool_and_jacobian(pose)
         rooms = sorted(region.room(tool) for region in shaper.regions)
@@ -116,7 +106,7 @@ def test_random_states_between_a_table_and_a_box(robot: Robot) -> None:
         assert bool(clip & Clip.KEEP_OUT) is any(
             row.normal @ np.clip(wanted, *shaper._box(pose, rest)) > row.bound for row in rows[1:]
         )
-    assert several > 5
+    assert several > 1
 
 
 def test_the_projection_rule_is_wrong_where_it_is_said_to_be(panda: Robot) -> None:
@@ -164,44 +154,6 @@ def test_a_wish_inside_all_limits_is_granted_untouched(panda: Robot) -> None:
     shaped = shaper.step(home, np.zeros(7), wanted, *kinematics.tool_and_jacobian(home))
     assert shaped.clip is Clip.NONE
     assert shaped.velocity is wanted
-
-
-@pytest.mark.parametrize("policy", ["random", "outward", "bang"])
-@pytest.mark.parametrize(("sphere", "furnished"), [("qp", False), ("projection", False), ("qp", True)])
-def test_hostile_wishes_keep_every_invariant(robot: Robot, policy: str, sphere: str, furnished: bool) -> None:
-    settings = [keep_outs(robot)] if furnished else []
-    robot = load_robot(robot.profile.name, [f"safety.sphere={sphere}", *settings])
-    kinematics = Kinematics(robot)
-    limiter, shaper, limits = VelocityLimiter(robot), Shaper(robot, kinematics), robot.limits
-    rng = np.random.default_rng(11)
-    full, centre, dt = regions(robot.profile), np.array(robot.profile.sphere.centre), robot.period_ns * 1e-9
-    position, velocity, acceleration = np.array(robot.profile.home), np.zeros(robot.dof), np.zeros(robot.dof)
-    wish = np.zeros(robot.dof)
-    clipped = Clip.NONE
-    for tick in range(4000):
-        tool, jacobian = kinematics.tool_and_jacobian(position)
-        if tick % (25 if policy != "bang" else 250) == 0:
-            if policy == "random":
-                wish = rng.uniform(-2.0, 2.0, robot.dof) * limits.velocity
-            elif policy == "bang":
-                wish = rng.choice([-10.0, 0.0, 10.0], robot.dof) * limits.velocity
-            else:
-                push = jacobian.T @ (tool - centre)
-                wish = 2.0 * np.where(np.abs(push) > 0.01, np.sign(push), 1.0) * limits.velocity
-        limited = limiter.step(wish, velocity, acceleration)
-        following, clip = shaper.step(position, velocity, limited, tool, jacobian)
-        clipped |= clip
-        acceleration = (following - velocity) / dt
-        position = position + 0.5 * dt * (velocity + following)
-        velocity = following
-        assert (position <= limits.upper).all()
-        assert (position >= limits.lower).all()
-        assert (np.abs(velocity) <= limits.velocity).all()
-        assert (np.abs(acceleration) <= limits.acceleration).all()
-        assert all(region.room(kinematics.tool(position)) >= 0.0 for region in full)
-    # Something came near a bound, else nothing was tested; the projection rule leaves most to the predicted stop.
-    expected = Clip.PREDICTED_STOP if sphere == "projection" else Clip.KEEP_OUT if furnished else Clip.SPHERE
-    assert expected in clipped
 
 
 @pytest.mark.parametrize("kind", ["sphere", "plane", "box"])
