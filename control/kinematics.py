@@ -26,14 +26,7 @@ class Kinematics:
         profile = robot.profile
         full = build_model(robot)
         names = [joint.name for joint in profile.joints]
-        fingers = {finger.name: finger for finger in profile.gripper.fingers} if profile.gripper else {}
-        others = [name for name in full.names if name != "universe" and name not in names]
-        reference = pin.neutral(full)
-        for name in others:
-            if name in fingers:
-                finger = fingers[name]
-                reference[full.joints[full.getJointId(name)].idx_q] = 0.5 * (finger.closed + finger.open)
-        self.model = pin.buildReducedModel(full, [full.getJointId(name) for name in others], reference)
+        self.model = pin.buildReducedModel(full, *locked(robot, full, opening=0.5))
         if [name for name in self.model.names if name != "universe"] != names:
             raise ConfigError(
                 f"{robot.source}: joints must be listed in the model's order: {list(self.model.names)[1:]}"
@@ -82,6 +75,23 @@ class Kinematics:
         """Return the joint-space inertia (n, n), kg m^2."""
         upper = np.triu(pin.crba(self.model, self._data, position))
         return np.array(upper + np.triu(upper, 1).T)
+
+
+def locked(robot: Robot, full: pin.Model, opening: float) -> tuple[list[int], Vector]:
+    """Return the joints of the whole model that the profile does not move, and where they are locked.
+
+    Args:
+        opening: of the gripper, from 0 (closed) to 1.
+    """
+    names = {joint.name for joint in robot.profile.joints}
+    others = [full.getJointId(name) for name in full.names if name != "universe" and name not in names]
+    configuration = pin.neutral(full)
+    for finger in robot.profile.gripper.fingers if robot.profile.gripper else ():
+        if not full.existJointName(finger.name):
+            raise ConfigError(f"{robot.source}: gripper: finger {finger.name!r} is not in the model")
+        coordinate = full.joints[full.getJointId(finger.name)].idx_q
+        configuration[coordinate] = finger.closed + opening * (finger.open - finger.closed)
+    return others, configuration
 
 
 def build_model(robot: Robot) -> pin.Model:

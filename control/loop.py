@@ -64,8 +64,9 @@ class Loop:
 
     def __init__(self, robot: Robot, rig: Rig, clock: Clock, link: Link) -> None:
         self.robot = robot
-        self.supervisor = Supervisor(robot)
         self.kinematics = Kinematics(robot)
+        self._motion = Motion(robot, self.kinematics)
+        self.supervisor = Supervisor(robot, self._motion.scene)
         self.closed = False
         self.lateness_ns = 0
         """How late the present tick began; set by whoever paces the loop."""
@@ -78,7 +79,6 @@ class Loop:
         rig.arm.inspect_with(self._guard)
         self._clock = clock
         self._link = link
-        self._motion = Motion(robot, self.kinematics)
         self._publisher = Publisher(link, clock, robot.dof)
         self._routine: Routine | None = None
         self._routine_ends_ns = 0
@@ -302,7 +302,7 @@ class Loop:
             case Verb.PARK:
                 self._reset(Goto(self.robot, np.array(self.robot.profile.rest), "park", self.kinematics), now)
             case Verb.RETREAT:
-                self._reset(Retreat(self.robot, self.kinematics), now)
+                self._reset(Retreat(self.robot, self.kinematics, self._motion.scene), now)
             case Verb.SETTLE:
                 self._reset(Settle(self.robot), now)
             case Verb.STOP:

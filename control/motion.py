@@ -5,6 +5,7 @@ Holds everything that has a memory between two ticks of motion, and nothing that
 
 import numpy as np
 
+from robotctl.control.collision import CollisionModel
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
 from robotctl.control.lowering import damp
@@ -25,7 +26,7 @@ class Motion:
         """Build everything that a motion needs.
 
         Raises:
-            ConfigError: if the profile's home or rest is where the tool may not be.
+            ConfigError: if the profile's home or rest is where tool or links may not be.
         """
         self.rest = np.zeros(robot.dof)
         """What is wanted of an arm that is to brake and stay."""
@@ -36,12 +37,13 @@ class Motion:
         self.command = Command(CommandMode.TRACK, self.rest, self.rest, self.rest)
         self._kinematics = kinematics
         self._limiter = VelocityLimiter(robot)
-        self._shaper = Shaper(robot, kinematics)
+        self.scene = CollisionModel(robot, kinematics) if robot.profile.collision else None
+        self._shaper = Shaper(robot, kinematics, self.scene)
         self._torque_limiter = TorqueLimiter(robot)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
         self._stale_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
-        _refuse_forbidden_poses(robot, kinematics)
+        self._refuse_forbidden_poses(robot)
 
     def begin(self, position: Vector) -> Command:
         """Return the command that holds a measured pose, and lead on from there."""
@@ -107,14 +109,19 @@ class Motion:
         self.command = damp(self._kinematics, position, share)
         return self.command
 
-
-def _refuse_forbidden_poses(robot: Robot, kinematics: Kinematics) -> None:
-    for key in ("home", "rest"):
-        tool = kinematics.tool(np.array(getattr(robot.profile, key)))
-        for region in regions(robot.profile, robot.profile.safety.sphere_margin):
-            room = region.room(tool)
-            if room < 0.0:
-                what = (
-                    f"{robot.source}: {key}: the tool would be {-1e3 * room:.0f} mm past the bound of {region.name!r}"
-                )
-                raise ConfigError(what, "change the pose or the region")
+    def _refuse_forbidden_poses(self, robot: Robot) -> None:
+        safety, remedy = robot.profile.safety, "change the pose, or what stands in its way"
+        for key in ("home", "rest"):
+            pose = np.array(getattr(robot.profile, key))
+            tool = self._kinematics.tool(pose)
+            for region in regions(robot.profile, safety.sphere_margin):
+                room = region.room(tool)
+                if room < 0.0:
+                    what = f"{key}: the tool would be {-1e3 * room:.0f} mm past the bound of {region.name!r}"
+                    raise ConfigError(f"{robot.source}: {what}", remedy)
+            if self.scene is None:
+                continue
+            for (one, other), clearance in zip(self.scene.pairs, self.scene.clearances(pose), strict=True):
+                if clearance < safety.proximity_stop + safety.proximity_margin:
+                    what = f"{key}: {one} and {other} would be {1e3 * clearance:.0f} mm apart"
+                    raise ConfigError(f"{robot.source}: {what}", f"{remedy}; or list them in collision.ignore")

@@ -70,8 +70,11 @@ def locate(package: str, file: str) -> Path:
     return Path(str(found[0].locate())).resolve()
 
 
-def load_description(path: Path, root: str | None = None) -> Description:
+def load_description(path: Path, root: str | None = None, *, collision: bool = False) -> Description:
     """Read and normalise a URDF, or the body `root` of an MJCF.
+
+    Args:
+        collision: keep the geometry that a collision check needs; meshes are named so that they are found.
 
     Raises:
         ConfigError: if the file is not well-formed, is neither language, or lacks the body.
@@ -81,18 +84,18 @@ def load_description(path: Path, root: str | None = None) -> Description:
     except ET.ParseError as error:
         raise ConfigError(f"{path}: not well-formed XML: {error}") from None
     if tree.tag == "robot":
-        return _urdf(tree)
+        return _urdf(tree, collision)
     if tree.tag == "mujoco":
-        return _mjcf(tree, path, root)
+        return _mjcf(tree, path, root, collision)
     raise ConfigError(f"{path}: <{tree.tag}> is neither a URDF nor an MJCF")
 
 
-def _urdf(robot: ET.Element) -> Description:
+def _urdf(robot: ET.Element, collision: bool) -> Description:
     for tag in ("transmission", "gazebo", "mujoco", "material"):
         for element in robot.findall(tag):
             robot.remove(element)
     for link in robot.findall("link"):
-        for tag in ("visual", "collision"):
+        for tag in ("visual",) if collision else ("visual", "collision"):
             for element in link.findall(tag):
                 link.remove(element)
     limits = {}
@@ -112,7 +115,7 @@ def _urdf(robot: ET.Element) -> Description:
     return Description(ET.tostring(robot, encoding="unicode"), "urdf", limits)
 
 
-def _mjcf(model: ET.Element, path: Path, root: str | None) -> Description:
+def _mjcf(model: ET.Element, path: Path, root: str | None, collision: bool) -> Description:
     world = model.find("worldbody")
     bodies = [] if world is None else world.findall("body")
     names = [body.get("name", "") for body in bodies]
@@ -122,16 +125,18 @@ def _mjcf(model: ET.Element, path: Path, root: str | None) -> Description:
         world.remove(element)
     # Pinocchio puts a body that stands alone under the world at the origin; inside a fixed root it keeps its place.
     ET.SubElement(world, "body", name="robotctl_root").append(bodies[names.index(root)])
-    for tag in ("asset", "actuator", "sensor", "equality", "contact", "tendon", "keyframe", "visual", "statistic"):
+    for tag in ("actuator", "sensor", "equality", "contact", "tendon", "keyframe", "visual", "statistic"):
         for element in model.findall(tag):
             model.remove(element)
+    compiler = model.find("compiler")
+    if compiler is None or compiler.get("angle", "degree") != "radian":
+        raise ConfigError(f"{path}: angles in degrees", 'set <compiler angle="radian"/> and convert the file')
+    compiler.set("meshdir", str(path.parent / compiler.get("meshdir", compiler.get("assetdir", ""))))
+    unused = {"camera", "light"} if collision else {"camera", "light", "geom", "asset"}
     for parent in list(model.iter()):
         for element in list(parent):
-            if element.tag in ("geom", "camera", "light"):
+            if element.tag in unused:
                 parent.remove(element)
-    compiler = model.find("compiler")
-    if compiler is not None and compiler.get("angle", "degree") != "radian":
-        raise ConfigError(f"{path}: angles in degrees", 'set <compiler angle="radian"/> and convert the file')
     limits = {}
     for joint in world.iter("joint"):
         lower, upper = (float(part) for part in joint.get("range", f"{-_FULL_TURN} {_FULL_TURN}").split())

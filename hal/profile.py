@@ -237,6 +237,22 @@ class Safety(_Strict):
     watchman_s: Positive = 0.050
     """Time without a tick of an armed arm's loop after which the watchman takes its drives. Shorter than the drives'
     own watchdogs, or they go off first."""
+    proximity_slow: Positive = 0.020
+    """Clearance between two links, or a link and a keep-out, below which they approach ever more slowly, m."""
+    proximity_stop: Positive = 0.005
+    """Measured clearance at which the arm is stopped, m."""
+    proximity_margin: NotNegative = 0.003
+    """Kept free beyond `proximity_stop`, m; covers the tracking error."""
+
+
+class Collision(_Strict):
+    """What is watched for contact between links, and between links and keep-outs."""
+
+    ignore: list[tuple[str, str]] = []
+    """Pairs of links (or of a link and a keep-out) that touch by construction, or that cannot meet.
+
+    Links on one joint, or on neighbouring joints, are no pair to begin with.
+    """
 
 
 class CanBus(_Strict):
@@ -292,6 +308,8 @@ class RobotProfile(_Strict):
     twin: Twin = Twin()
     keep_out: list[KeepOut] = []
     """Planes and boxes where neither tool point nor moving links may be."""
+    collision: Collision | None = Collision()
+    """None turns the watch for contact off: for a model without geometry."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "RobotProfile":
@@ -308,6 +326,9 @@ class RobotProfile(_Strict):
         twice = {motor for motor in ids if ids.count(motor) > 1}
         if twice:
             raise ValueError(f"drive.id: {sorted(twice)} used by more than one motor")
+        near = self.safety.proximity_stop + self.safety.proximity_margin
+        if near >= self.safety.proximity_slow:
+            raise ValueError(f"safety.proximity_slow: not beyond proximity_stop and proximity_margin ({near} m)")
         names = ["sphere", *(item.name for item in self.keep_out)]
         same = {name for name in names if names.count(name) > 1}
         if same:

@@ -29,6 +29,15 @@ class Row(NamedTuple):
     bound: float
     """m/s"""
 
+    @staticmethod
+    def keeping(room: float, gain: float, normal: Vector) -> "Row":
+        """Return the row that lets room shrink by `gain` times itself, m/s, or demands its return where it is negative.
+
+        Args:
+            normal: how fast room shrinks with each joint (n,), m/rad.
+        """
+        return Row(normal, max(gain * room, -_LARGEST_CORRECTION))
+
 
 class Region(ABC):
     """Where the tool point may be. Points are (3,), m, in the base frame."""
@@ -64,7 +73,7 @@ class Region(ABC):
         outward = self.outward(point)
         if outward is None:
             return None
-        return Row(outward @ jacobian, max(self.gain * self.room(point), -_LARGEST_CORRECTION))
+        return Row.keeping(self.room(point), self.gain, outward @ jacobian)
 
 
 class Sphere(Region):

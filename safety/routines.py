@@ -3,7 +3,7 @@
 | | routine   | what it does                                                            |
 |-|-----------|-------------------------------------------------------------------------|
 |R0| `Settle`  | waits for measured standstill                                           |
-|R1| `Retreat` | leads joints and tool back inside, at a tenth of the caps               |
+|R1| `Retreat` | leads joints, tool and links back inside, at a tenth of the caps        |
 |R2| `Goto`    | leads the joints straight to a pose (home, rest)                        |
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
+from robotctl.safety.proximity import NothingNear, Scene
 from robotctl.safety.region import regions
 
 _GAIN = 3.0
@@ -23,6 +24,8 @@ _ARRIVED = 2e-3
 _RETREAT_SCALE = 0.1
 _RETREAT_DEPTH = 0.01
 """How far inside a boundary a retreat ends, m and rad."""
+_RETREAT_CLEARANCE = 2e-3
+"""Beyond what the shaper keeps, m. No more, since some links are never far from each other."""
 
 
 class Geometry(Protocol):
@@ -57,18 +60,21 @@ class Settle(Routine):
 
 
 class Retreat(Routine):
-    """R1: back inside the joint limits and all regions, slowly, straight along the gradient."""
+    """R1: back inside the joint limits and all regions, and links apart, slowly, straight along the gradient."""
 
     name = "retreat"
     timeout_s = 30.0
 
-    def __init__(self, robot: Robot, geometry: Geometry) -> None:
-        margin = robot.profile.safety.position_margin + _RETREAT_DEPTH
+    def __init__(self, robot: Robot, geometry: Geometry, scene: Scene | None = None) -> None:
+        safety = robot.profile.safety
+        margin = safety.position_margin + _RETREAT_DEPTH
         self._lower = robot.limits.lower + margin
         self._upper = robot.limits.upper - margin
         self._cap = _RETREAT_SCALE * robot.limits.velocity
         self._geometry = geometry
-        self._regions = regions(robot.profile, robot.profile.safety.sphere_margin)
+        self._regions = regions(robot.profile, safety.sphere_margin)
+        self._scene = scene or NothingNear(robot.dof)
+        self._clear = safety.proximity_stop + safety.proximity_margin + _RETREAT_CLEARANCE
 
     def velocity(self, sample: Sample, position: Vector) -> Vector | None:
         inside = np.minimum(np.maximum(position, self._lower), self._upper)
@@ -80,7 +86,11 @@ class Retreat(Routine):
             short, outward = _RETREAT_DEPTH - region.room(tool), region.outward(tool)
             if short > 0.0 and outward is not None:
                 wanted = wanted - jacobian.T @ np.linalg.solve(damped, _GAIN * short * outward)
-        if float(np.abs(inside - position).max()) < _ARRIVED and outside < 0.2 * _RETREAT_DEPTH:
+        clearances = self._scene.measure(position, range(len(self._scene.pairs)))
+        tight = np.flatnonzero(clearances < self._clear).tolist()
+        for pair, slope in zip(tight, self._scene.approach(position, tight), strict=True):
+            wanted = wanted - slope * (_GAIN * (self._clear - clearances[pair]) / (slope @ slope + 1e-3))
+        if float(np.abs(inside - position).max()) < _ARRIVED and outside < 0.2 * _RETREAT_DEPTH and not tight:
             return None
         # At least a crawl, so that the end is reached.
         fastest = float((np.abs(wanted) / self._cap).max())

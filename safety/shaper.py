@@ -5,11 +5,11 @@ acceleration: q' = q + dt (v + v')/2. Three things hold for the v' it returns:
 
 1. it lies in a box: velocity caps, acceleration caps, and per joint a bound from which braking at the acceleration
    cap ends at the soft limit;
-2. it is the velocity in that box closest to the wanted one that keeps the row of every region (one QP; for the
-   sphere there is the named alternative `projection`);
-3. braking every joint at its cap from the next reference keeps the tool inside every region. Where a candidate fails
-   that, the shaper brakes instead, which is the very motion that the previous step proved; so the claim carries
-   over from step to step, whatever is asked for.
+2. it is the velocity in that box closest to the wanted one that keeps the row of every region and of every pair of
+   links that is near (one QP; for the sphere there is the named alternative `projection`);
+3. braking every joint at its cap from the next reference keeps the tool inside every region and the links apart.
+   Where a candidate fails that, the shaper brakes instead, which is the very motion that the previous step proved;
+   so the claim carries over from step to step, whatever is asked for.
 """
 
 from enum import IntFlag
@@ -20,6 +20,7 @@ import numpy as np
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
+from robotctl.safety.proximity import NothingNear, ProximityLimit, Scene
 from robotctl.safety.region import Region, Row, regions
 
 _SOFT = 8
@@ -58,6 +59,7 @@ class Clip(IntFlag):
     RECOVERY = 16
     """Not a limit: the arm began outside its limits, and only a retreat may move it."""
     KEEP_OUT = 32
+    PROXIMITY = 64
 
 
 class Shaped(NamedTuple):
@@ -71,7 +73,8 @@ class Shaped(NamedTuple):
 class Shaper:
     """Shapes the velocities of one robot. Holds scratch memory only; every call stands for itself."""
 
-    def __init__(self, robot: Robot, model: ToolModel) -> None:
+    def __init__(self, robot: Robot, model: ToolModel, scene: Scene | None = None) -> None:
+        """Shape for a robot's limits; with a `scene`, for its clearances, too."""
         safety, limits = robot.profile.safety, robot.limits
         usable = 1.0 - safety.cap_margin
         self._dt = robot.period_ns * 1e-9
@@ -83,6 +86,8 @@ class Shaper:
         self._gain = safety.sphere_gain
         self._projects = safety.sphere == "projection"
         self._rowed = self.regions[1:] if self._projects else self.regions
+        scene = scene or NothingNear(robot.dof)
+        self._proximity = ProximityLimit(robot, scene, len(_SAMPLES))
         self._n = robot.dof
         # Upper and mirrored lower bounds side by side: one vector operation serves both.
         margin = safety.position_margin
@@ -101,8 +106,8 @@ class Shaper:
         self._reach_step = model.reach * self._dt
         self._reach_braking = model.reach / (2.0 * self.acceleration_cap)
         self._hessian = np.eye(self._n)
-        firm = np.zeros(self._n + len(self.regions), dtype=np.int32)
         # Where braking within the acceleration caps cannot keep the rows, the rows give way, not the caps.
+        firm = np.zeros(self._n + len(self.regions) + len(scene.pairs), dtype=np.int32)
         giving = firm.copy()
         giving[self._n :] = _SOFT
         self._senses = (firm, giving)
@@ -124,13 +129,11 @@ class Shaper:
         else:
             clip = Clip.POSITION if (np.abs(wanted) <= self.velocity_cap).all() else Clip.VELOCITY
         rooms = [(region.room(tool), region) for region in self.regions]
-        if self._gain * min(room for room, _ in rooms) < np.abs(best) @ self._reach:
-            best, touched = self._into_regions(best, wanted, lower, upper, tool, jacobian)
+        links, required = self._proximity.look(position)
+        if links or self._gain * min(room for room, _ in rooms) < np.abs(best) @ self._reach:
+            best, touched = self._keep_rows(best, wanted, lower, upper, tool, jacobian, links)
             clip |= touched
-        speed = np.abs(best)
-        way = speed @ (self._reach_step + self._reach_braking * speed)
-        near = [(room, region) for room, region in rooms if room < way]
-        if near and not self._stops_inside(position, velocity, best, tool, near):
+        if not self._stops(position, velocity, best, tool, rooms, required):
             clip |= Clip.PREDICTED_STOP
             best = self.brake(velocity)
         return Shaped(best, clip)
@@ -159,8 +162,15 @@ class Shaper:
         root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * room) - self._half_step2
         return np.minimum(root, self._cap2)
 
-    def _into_regions(
-        self, best: Vector, wanted: Vector, lower: Vector, upper: Vector, tool: Vector, jacobian: Vector
+    def _keep_rows(
+        self,
+        best: Vector,
+        wanted: Vector,
+        lower: Vector,
+        upper: Vector,
+        tool: Vector,
+        jacobian: Vector,
+        links: list[Row],
     ) -> Shaped:
         """Return the velocity in the box closest to the wanted one that keeps all rows, `best` if that does."""
         clip = Clip.NONE
@@ -170,16 +180,15 @@ class Shaper:
                 clip = Clip.SPHERE
                 scale = float((np.abs(projected) / self.velocity_cap).max())
                 wanted = best = np.minimum(np.maximum(projected / max(1.0, scale), lower), upper)
-        rows = []
-        breaks = False
+        rows = [(row, Clip.PROXIMITY) for row in links]
         for region in self._rowed:
             row = region.row(tool, jacobian)
             if row is not None:
-                rows.append(row)
-                if float(row.normal @ best) > row.bound:
-                    breaks = True
-                    clip |= Clip.SPHERE if region is self._sphere else Clip.KEEP_OUT
-        return Shaped(self._solve(wanted, lower, upper, rows) if breaks else best, clip)
+                rows.append((row, Clip.SPHERE if region is self._sphere else Clip.KEEP_OUT))
+        broken = [flag for row, flag in rows if float(row.normal @ best) > row.bound]
+        for flag in broken:
+            clip |= flag
+        return Shaped(self._solve(wanted, lower, upper, [row for row, _ in rows]) if broken else best, clip)
 
     def _solve(self, wanted: Vector, lower: Vector, upper: Vector, rows: list[Row]) -> Vector:
         normals = np.array([row.normal for row in rows])
@@ -191,22 +200,29 @@ class Shaper:
                 return np.asarray(np.minimum(np.maximum(solution, lower), upper))
         return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
 
-    def _stops_inside(
+    def _stops(
         self,
         position: Vector,
         velocity: Vector,
         following: Vector,
         tool: Vector,
-        near: list[tuple[float, Region]],
+        rooms: list[tuple[float, Region]],
+        required: Vector,
     ) -> bool:
-        """Return whether the tool stays inside while every joint brakes at its cap from `following`.
+        """Return whether tool and links keep clear while every joint brakes at its cap from `following`.
 
         The joints do not come to rest together, so the way is sampled in time, not between its ends. Already
         outside, the tool may get no further out.
         """
         start = position + (0.5 * self._dt) * (velocity + following)
-        rest = np.maximum(np.abs(following) / self.acceleration_cap, 1e-9)
+        speed = np.abs(following)
+        rest = np.maximum(speed / self.acceleration_cap, 1e-9)
         times = np.minimum(_SAMPLES * rest.max(), rest)
         poses = start + following * times * (1.0 - 0.5 * times / rest)
-        path = np.array([tool, *(self._tool(pose) for pose in poses)])
-        return all(region.along(path) >= min(0.0, room) - _ROUNDING for room, region in near)
+        way = speed @ (self._reach_step + self._reach_braking * speed)
+        near = [(room, region) for room, region in rooms if room < way]
+        if near:
+            path = np.array([tool, *(self._tool(pose) for pose in poses)])
+            if any(region.along(path) < min(0.0, room) - _ROUNDING for room, region in near):
+                return False
+        return self._proximity.keeps(poses, required)

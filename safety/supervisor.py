@@ -14,6 +14,7 @@ from robotctl.safety.deadman import Deadman
 from robotctl.safety.drives import BusHealth, DriveHealth
 from robotctl.safety.machine import ENABLED, Event, Refused, State, after
 from robotctl.safety.protections import FeedbackAge, PositionBreach, SphereBreach
+from robotctl.safety.proximity import NothingNear, ProximityBreach, Scene
 from robotctl.safety.target import Hold, Target
 from robotctl.safety.tracking import Drift, Overspeed, ToolSpeed, TrackingError
 from robotctl.safety.trip import Category, Clearing, Protection, Trip
@@ -23,7 +24,7 @@ _TRIP_EVENTS = {
     Category.BRAKE_OFF: Event.TRIP_OFF,
     Category.CUT: Event.TRIP_CUT,
 }
-_RECOVERABLE = (Protection.POSITION, Protection.SPHERE)
+_RECOVERABLE = (Protection.POSITION, Protection.SPHERE, Protection.PROXIMITY)
 """After these, acknowledging permits nothing but the retreat."""
 _STANDSTILL_TICKS = 5
 _STOP_ALLOWANCE_S = 0.5
@@ -32,7 +33,7 @@ _STOP_ALLOWANCE_S = 0.5
 class Supervisor:
     """State machine, protections and admission of one arm."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, scene: Scene | None = None) -> None:
         safety = robot.profile.safety
         self.state = State.OFF
         self.epoch = 0
@@ -53,6 +54,7 @@ class Supervisor:
         self._believable = Believable(robot)
         self._position = PositionBreach(robot)
         self._sphere = SphereBreach(robot)
+        self._proximity = ProximityBreach(robot, scene or NothingNear(robot.dof))
         self._tracking = TrackingError(robot)
         self._drift = Drift(robot)
         self._overspeed = Overspeed(robot)
@@ -161,7 +163,8 @@ class Supervisor:
             self._tool_speed.check(tool, sample.stamp_ns, slow=self.state is State.RESET),
         ]
         if not self.recovery:
-            trips += [self._position.check(sample), self._sphere.check(tool, sample.stamp_ns)]
+            near = self._proximity.check(sample.position, sample.stamp_ns)
+            trips += [self._position.check(sample), self._sphere.check(tool, sample.stamp_ns), near]
         if self.state in _MOVING:
             trips.append(self.deadman.check(now_ns))
         if self.state is State.RUN:
@@ -177,8 +180,9 @@ class Supervisor:
             self._clear(now_ns)
 
     def begin_recovery_if_outside(self, sample: Sample, tool: Vector) -> None:
-        """When armed outside its limits or its sphere, the arm may do nothing but retreat."""
-        if not self._position.inside(sample.position) or self._sphere.outside(tool) > 0.0:
+        """When armed outside its limits or regions, or too near to something, the arm may do nothing but retreat."""
+        outside = not self._position.inside(sample.position) or self._sphere.outside(tool) > 0.0
+        if outside or self._proximity.check(sample.position, sample.stamp_ns) is not None:
             self.recovery = True
 
     def stands(self, sample: Sample) -> bool:

@@ -1,0 +1,132 @@
+"""P20, proximity: no link may come too close to another one, or to a keep-out.
+
+The geometry stands behind a protocol. It tells the clearance d(q) of each pair, and how fast that can change with
+each joint at most; so one measurement serves until the pose has moved by what was to spare:
+
+    d(q) >= d(q0) - reach |q - q0|
+
+Only then is the pair measured again (conservative advancement). As all that is asked is whether a pair has enough
+clearance, the answers are those of measuring everything every time.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Vector
+from robotctl.safety.region import Row
+from robotctl.safety.trip import Category, Protection, Trip
+
+_ROUNDING = 2e-5
+"""By how much two measurements of one clearance may differ, m."""
+
+
+class Scene(Protocol):
+    """What has to be known of the geometry: m pairs of things that are to stay apart."""
+
+    @property
+    def pairs(self) -> Sequence[tuple[str, str]]:
+        """Names of the two sides of each pair."""
+        ...
+
+    @property
+    def reach(self) -> Vector:
+        """A bound on how fast each clearance changes with each joint (m, n), m/rad."""
+        ...
+
+    def measure(self, position: Vector, pairs: Sequence[int]) -> Vector:
+        """Return the clearance of some pairs at joint positions (n,), m; negative where they overlap."""
+        ...
+
+    def approach(self, position: Vector, pairs: Sequence[int]) -> Sequence[Vector]:
+        """Return for some pairs how fast their clearance shrinks with each joint (n,), m/rad."""
+        ...
+
+
+class NothingNear:
+    """A scene without pairs, for an arm whose geometry is not known."""
+
+    def __init__(self, dof: int) -> None:
+        self.pairs = ()
+        self.reach = np.zeros((0, dof))
+
+    def measure(self, position: Vector, pairs: Sequence[int]) -> Vector:
+        return np.zeros(0)
+
+    def approach(self, position: Vector, pairs: Sequence[int]) -> Sequence[Vector]:
+        return ()
+
+
+class Clearances:
+    """Lower bounds on the clearances at some poses that move little from one question to the next."""
+
+    def __init__(self, scene: Scene, poses: int) -> None:
+        self._scene = scene
+        self._fade = scene.reach.T.copy()
+        self._poses = np.zeros((poses, len(self._fade)))
+        self._bounds = np.full((poses, len(scene.pairs)), -np.inf)
+
+    def at(self, poses: Vector, enough: float | Vector) -> Vector:
+        """Return a bound for every pose (k, n) and pair (k, m), m; those below `enough` are measurements."""
+        bounds = self._bounds - np.abs(poses - self._poses) @ self._fade
+        used_up = ~(bounds >= enough)  # in this direction, so that NaN is measured, too
+        if used_up.any():
+            for index in range(len(poses)):
+                pairs = np.flatnonzero(used_up[index]).tolist()
+                if pairs:
+                    bounds[index, pairs] = self._scene.measure(poses[index], pairs)
+        self._poses, self._bounds = np.array(poses), bounds
+        return bounds
+
+
+class ProximityLimit:
+    """What the shaper keeps: slow where pairs are near, and enough clearance until the arm has stopped."""
+
+    def __init__(self, robot: Robot, scene: Scene, samples: int) -> None:
+        """Watch a reference, and `samples` poses on its way to rest."""
+        safety = robot.profile.safety
+        self.stop = safety.proximity_stop + safety.proximity_margin
+        self._slow = safety.proximity_slow
+        self._gain = safety.sphere_gain
+        self._scene = scene
+        self._here = Clearances(scene, 1)
+        self._ahead = Clearances(scene, samples)
+
+    def look(self, position: Vector) -> tuple[list[Row], Vector]:
+        """Return the rows of the pairs that are near, and what clearance each pair has to keep from here on (m,), m.
+
+        A pair that is too close already may get no closer.
+        """
+        clearances = self._here.at(position[np.newaxis], self._slow)[0]
+        near = np.flatnonzero(clearances < self._slow).tolist()
+        slopes = self._scene.approach(position, near) if near else ()
+        rows = [
+            Row.keeping(clearances[pair] - self.stop, self._gain, slope)
+            for pair, slope in zip(near, slopes, strict=True)
+        ]
+        return rows, np.minimum(clearances, self.stop) - _ROUNDING
+
+    def keeps(self, path: Vector, required: Vector) -> bool:
+        """Return whether every pair has its required clearance (m,) at all poses of a path (samples, n)."""
+        return bool((self._ahead.at(path, required) >= required).all())
+
+
+class ProximityBreach:
+    """P20: a measured clearance is below the profile's `proximity_stop`."""
+
+    def __init__(self, robot: Robot, scene: Scene) -> None:
+        self._stop = robot.profile.safety.proximity_stop
+        self._pairs = scene.pairs
+        self._clearances = Clearances(scene, 1)
+
+    def check(self, position: Vector, stamp_ns: int) -> Trip | None:
+        """Judge measured joint positions (n,)."""
+        clearances = self._clearances.at(position[np.newaxis], self._stop)[0]
+        if (clearances >= self._stop).all():  # in this direction, so that NaN trips, too
+            return None
+        closest = int(clearances.argmin())
+        one, other = self._pairs[closest]
+        apart = f"{one} and {other} measured {1e3 * clearances[closest]:.1f} mm apart"
+        return Trip(Protection.PROXIMITY, Category.BRAKE_HOLD, f"{apart}; acknowledge, then retreat", stamp_ns)
