@@ -15,7 +15,7 @@ from robotctl.control.loop import Verb
 from robotctl.control.process import ProcessConfig
 from robotctl.control.session import Session, history_slots
 from robotctl.control.shared import Link
-from robotctl.control.watchman import WatchmanConfig
+from robotctl.control.watchman import LONGEST_RESCUE_S, WatchmanConfig
 from robotctl.hal.can.channel import is_shared
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import ConfigError, HardwareError
@@ -27,8 +27,7 @@ _START_TIMEOUT_S = 30.0
 _BEAT_S = 0.05
 """How often the control process is shown that this one is alive."""
 _CLOSE_TIMEOUT_S = 6.0
-_RESCUE_TIMEOUT_S = 10.0
-"""Lowering an arm takes 2.5 s; drives that do not confirm, another second."""
+_RESCUE_TIMEOUT_S = LONGEST_RESCUE_S + 1.0
 _CLOSABLE = (State.READY, State.FAULT, State.SILENT)
 
 
@@ -96,6 +95,8 @@ class ProcessSession(Session):
             self._check()
             if time.monotonic() > deadline:
                 raise HardwareError("the control process did not come up", "run robotctl doctor")
+            if self._watchman is not None and self._watchman.poll() is not None:
+                raise HardwareError("the watchman ended before anything had begun", "run robotctl doctor")
             time.sleep(0.01)
         self.poll()
 

@@ -39,6 +39,7 @@ class Rescue:
             self._arm.take_over(damp(self._kinematics, legacy.position, 1.0))
         except RobotctlError as error:
             legacy.trip(f"{cause}; its drives cannot be reached: {error}", onset_ns)
+            legacy.tick(State.FAULT)
             return
         action = "damped, lowered and switched off" if self._damps else "switched off"
         legacy.trip(f"{cause}; its drives are {action}; look at the arm, then start again", onset_ns)

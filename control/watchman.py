@@ -29,6 +29,8 @@ from robotctl.safety.machine import State
 
 _LOOK_MS = 5
 """Between two looks at the loop; that its process is gone is known at once."""
+LONGEST_RESCUE_S = 9
+"""A bus can block whoever writes to it. Nobody may be left to end a watchman that hangs, so it ends by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +80,7 @@ class Watchman:
                 continue
             onset = self._clock.now_ns() - self._silence_ns + self._patience_ns
             signal.pidfd_send_signal(control_fd, signal.SIGKILL)  # stopped or late, it never sends a frame again
-            self._rescue.run(f"{what}, and its process was ended", onset)
+            _run(self._rescue, f"{what}, and its process was ended", onset)
             return
         if self._link.watch.power is not Power.OFF:
             self._mourn()
@@ -97,10 +99,16 @@ class Watchman:
         ago = (self._clock.now_ns() - legacy.stamp_ns) / 1e6
         what = f"the control process died {ago:.0f} ms after its last tick"
         if self._rescue is not None:
-            self._rescue.run(what, legacy.stamp_ns)
+            _run(self._rescue, what, legacy.stamp_ns)
             return
         legacy.trip(f"{what}, and its drives with it", legacy.stamp_ns)
         legacy.tick(State.FAULT)
+
+
+def _run(rescue: Rescue, cause: str, onset_ns: int) -> None:
+    signal.alarm(LONGEST_RESCUE_S)
+    rescue.run(cause, onset_ns)
+    signal.alarm(0)
 
 
 def main(text: str) -> int:
@@ -122,6 +130,7 @@ def main(text: str) -> int:
         go_real_time(WATCHMAN_PRIORITY)
         Watchman(robot, link, clock, rescue).watch(config.control_fd)
     finally:
+        registry.unregister(config.control)  # one that was killed could not do it itself
         entry.unlink(missing_ok=True)
     return 0
 

@@ -142,6 +142,12 @@ class ArmContract(_Contract):
         assert sample.position == pytest.approx(bench.home, abs=2e-3)
         assert (sample.joint_stamp_ns > 0).all()
 
+    def test_where_the_plant_lives_in_this_process_there_is_nothing_to_take_over(self, bench: Bench):
+        with pytest.raises(HardwareError, match="nothing to take over"):
+            bench.arm.take_over(bench.track(bench.home))
+        with pytest.raises(HardwareError, match="connect"):
+            bench.arm.read()
+
     # -- holding ----------------------------------------------------------------------------------------------------
 
     def test_enabled_it_holds_the_measured_pose(self, bench: Bench):

@@ -7,7 +7,7 @@ import pytest
 
 from robotctl.control.loop import Loop, Verb
 from robotctl.control.session import LockstepSession, Stopped
-from robotctl.control.shared import Link
+from robotctl.control.shared import Link, Power
 from robotctl.hal.arm import Arm
 from robotctl.hal.backend import Rig, open_backend
 from robotctl.hal.clock import VirtualClock
@@ -17,6 +17,7 @@ from robotctl.hal.types import Command, CommandMode, Sample, Sent, Truth
 from robotctl.safety.machine import ENABLED, State
 from robotctl.safety.shaper import Clip
 from robotctl.safety.target import FreeDrive, Hold, JointTorque, JointVelocity
+from robotctl.safety.trip import Category
 from robotctl.sim.motors.trouble import Mute, PowerCut
 
 SLOTS = 5000
@@ -813,3 +814,78 @@ def test_with_the_drives_off_a_late_loop_is_none_of_safetys_business(bench):
     bench.reach(State.READY)
     bench.clock.sleep_until(bench.clock.now_ns() + 10**9)
     assert bench.tick() is State.READY
+
+
+# -- neighbours ----------------------------------------------------------------------------------------------------
+
+
+def powers_during(bench, call):
+    """Let a call of the arm note what the watchman is told meanwhile."""
+    seen, original = [], getattr(bench.arm, call)
+
+    def noting():
+        seen.append(bench.link.watch.power)
+        original()
+
+    setattr(bench.arm, call, noting)
+    return seen
+
+
+def test_the_watchman_is_told_when_the_drives_are_on_and_when_that_changes(bench):
+    bench.reach(State.READY)
+    coming, going = powers_during(bench, "enable"), powers_during(bench, "disable")
+    assert bench.link.watch.power is Power.OFF
+    assert bench.ask(Verb.ARM) == ""
+    assert coming == [Power.CHANGING]
+    bench.lead(0.3, 0.2)
+    assert bench.link.watch.power is Power.ON
+    assert bench.ask(Verb.DISARM) == ""
+    assert bench.link.watch.power is Power.ON
+    bench.until(State.READY)
+    assert going == [Power.CHANGING]
+    assert bench.link.watch.power is Power.OFF
+    bench.loop.shut_down()
+    assert going == [Power.CHANGING, Power.OFF]  # what is off cannot be left half on
+
+
+def test_drives_that_do_not_confirm_are_left_to_the_watchman(bench):
+    bench.reach(State.ARMED)
+
+    def fail():
+        raise DriveError("panda_joint1", 1, "did not confirm")
+
+    bench.arm.disable = fail
+    with pytest.raises(DriveError):
+        bench.loop.shut_down()
+    assert bench.link.watch.power is Power.CHANGING
+
+
+def test_an_arm_that_is_damped_is_watched_until_it_is_down():
+    bench = Bench(load_robot("openarm"))
+    bench.reach(State.FAULT)
+    bench.tick(100)
+    assert bench.link.watch.power is Power.ON
+    assert bench.ask(Verb.CLOSE) == ""
+    while not bench.loop.closed:
+        assert bench.link.watch.power is Power.ON
+        bench.tick()
+    assert bench.link.watch.power is Power.OFF
+
+
+@pytest.mark.parametrize("state", [State.ARMED, State.RUN])
+@pytest.mark.parametrize("shows_life", [True, False])
+def test_an_arm_that_nobody_watches_does_not_move_on(bench, state, shows_life):
+    bench.reach(State.ARMED)
+    for _ in range(10):
+        if shows_life:
+            bench.link.watch.beat()
+        bench.tick()
+    if state is State.RUN:
+        bench.lead(0.2, 0.95)
+        assert bench.supervisor.state is State.RUN
+        bench.lead(0.2, 0.1)
+    else:
+        bench.tick(1000)
+    labels = [trip.protection.label for trip in bench.supervisor.trips]
+    assert labels == (["P27"] if shows_life and state is State.RUN else [])
+    assert all(trip.category is Category.BRAKE_HOLD for trip in bench.supervisor.trips)

@@ -1,5 +1,6 @@
-"""A session in a process of its own, around a control process that is busy when it is asked to end."""
+"""A session in a process of its own, around a control process that is busy when it is asked to end, or fails."""
 
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,15 +38,46 @@ def open_slow(robot, clock, channel=""):
 """
 
 
+FRAIL = """
+from pathlib import Path
+
+from robotctl.sim.backend import open_sim
+
+HERE = Path(__file__).parent
+
+
+def open_frail(robot, clock, channel=""):
+    rig = open_sim(robot, clock)
+    read = rig.arm.read
+
+    def frail():
+        if (HERE / "now").exists():
+            raise ZeroDivisionError("a bug")
+        return read()
+
+    def take_over(command):
+        (HERE / "taken").write_text(command.mode.name)
+
+    rig.arm.read = frail
+    rig.arm.take_over = take_over
+    return rig
+"""
+
+
+def install(folder: Path, name: str, source: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let child processes find a backend."""
+    (folder / f"{name}.py").write_text(source)
+    about = folder / f"{name}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[robotctl.backends]\n{name} = {name}:open_{name}\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("ROBOTCTL_RUNTIME_DIR", str(folder))
+
+
 @pytest.fixture
 def session(panda: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ProcessSession]:
-    (tmp_path / "slow.py").write_text(BACKEND)
-    about = tmp_path / "slow-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: slow\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[robotctl.backends]\nslow = slow:open_slow\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setenv("ROBOTCTL_RUNTIME_DIR", str(tmp_path))
+    install(tmp_path, "slow", BACKEND, monkeypatch)
     session = ProcessSession(panda, "slow")
     session.open()
     session.link.desk.ask(Verb.ARM)  # and whoever asked was interrupted
@@ -88,3 +120,30 @@ def test_a_channel_belongs_to_one_process_at_a_time(panda: Robot, tmp_path: Path
             pass
         registry.claim("slcan:/dev/ttyACM1").close()
     registry.claim(f"slcan:{port}").close()
+
+
+def test_a_bug_in_the_loop_hands_the_drives_to_the_watchman(
+    panda: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, "frail", FRAIL, monkeypatch)
+    with ProcessSession(panda, "frail", "slcan:nowhere") as session:
+        session.request(Verb.ARM)
+        (tmp_path / "now").touch()
+        with pytest.raises(HardwareError, match="ZeroDivisionError: a bug") as told:
+            session.advance(5.0)
+        assert "its drives are switched off" in str(told.value)
+        assert (tmp_path / "taken").read_text() == "DAMP"
+        assert [(trip["protection"], trip["stop_category"]) for trip in session.trips] == [("P27", 0)]
+        assert session.state is State.FAULT
+
+
+def test_a_bug_with_the_drives_off_leaves_nothing_to_take(
+    panda: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, "frail", FRAIL, monkeypatch)
+    with ProcessSession(panda, "frail", "slcan:nowhere") as session:
+        (tmp_path / "now").touch()
+        with pytest.raises(HardwareError, match="a bug"):
+            session.advance(5.0)
+        assert session.trips == []
+        assert not (tmp_path / "taken").exists()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from robotctl.control import shared
-from robotctl.control.shared import MAX_VALUES, Board, Desk, EventRing, Link, Mailbox, TickRing, tick_dtype
+from robotctl.control.shared import MAX_VALUES, Board, Desk, EventRing, Link, Mailbox, Power, TickRing, tick_dtype
 from robotctl.hal.robot import load_robot
 from robotctl.safety.admission import Admission
 from robotctl.safety.target import FreeDrive, Hold, JointTorque, JointVelocity
@@ -275,6 +275,34 @@ def test_the_copy_handed_out_does_not_change_under_the_readers_hands():
     for number in range(20, 200):
         write(ring, number)
     assert records["tick"].tolist() == list(range(20))
+
+
+def test_whoever_goes_on_with_a_ring_writes_whole_records_behind_the_last():
+    ring = a_ring()
+    for number in range(SLOTS + 5):
+        write(ring, number)
+    record = ring.latest()
+    record["tick"], record["tool"] = 4711, 3.0
+    ring.append(record)
+    assert ring.head == SLOTS + 6
+    assert ring.since(SLOTS + 4)[0]["tick"].tolist() == [SLOTS + 4, 4711]
+    assert ring.latest()["tool"].tolist() == [3.0, 3.0, 3.0]
+
+
+# -- the watch -----------------------------------------------------------------------------------------------------
+
+
+def test_the_watch_tells_of_the_drives_and_of_the_watchman():
+    link = Link.local(7, SLOTS)
+    number = link.desk.ask(3)
+    link.desk.hold(2)
+    assert (link.watch.power, link.watch.beats) == (Power.OFF, 0)
+    link.watch.power = Power.ON
+    link.watch.beat()
+    assert (link.watch.power, link.watch.beats) == (Power.ON, 1)
+    assert link.desk.pending() == (number, 3)
+    assert link.desk.grip == 2
+    assert link.events.since(0)[0] == []
 
 
 # -- the ring of events --------------------------------------------------------------------------------------------

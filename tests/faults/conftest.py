@@ -9,13 +9,20 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import can
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+
+from robotctl.hal.can.damiao.codec import Special, decode_feedback, is_feedback
+from robotctl.hal.can.damiao.motors import MOTORS
 
 KILLS = int(os.environ.get("ROBOTCTL_KILLS", "1"))
 MOMENTS = [random.Random(seed).uniform(0.0, 1.5) for seed in range(KILLS)]
 """When to strike, in seconds after a run has got going."""
+JOINTS = 7
 ROBOTCTL = [sys.executable, "-m", "robotctl.cli.main"]
 
 
@@ -89,12 +96,14 @@ class Run:
 
 
 class Emulator:
-    """`robotctl emulate` on a pseudo-terminal."""
+    """`robotctl emulate` on a pseudo-terminal, with a log of every frame."""
 
-    def __init__(self, folder: Path, *options: str) -> None:
+    def __init__(self, folder: Path, *options: str, robot: str = "openarm") -> None:
         self.log = folder / "emulate.log"
+        self.frames = folder / "bus.log"
+        command = [*ROBOTCTL, "emulate", "--robot", robot, "--log", str(self.frames), *options]
         with self.log.open("w") as output:
-            self.process = subprocess.Popen([*ROBOTCTL, "emulate", "--robot", "openarm", *options], stdout=output)
+            self.process = subprocess.Popen(command, stdout=output)
         deadline = time.monotonic() + 30.0
         while "channel: " not in self.text:
             assert self.process.poll() is None
@@ -105,6 +114,47 @@ class Emulator:
     @property
     def text(self) -> str:
         return self.log.read_text()
+
+    def end(self) -> None:
+        """End it so that its log is complete."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.send_signal(signal.SIGINT)
+        self.process.wait()
+
+    def heard(self) -> list["Heard"]:
+        """Return what the joints' drives were sent, once it has ended."""
+        return [
+            Heard(frame.timestamp, frame.arbitration_id, _kind(bytes(frame.data)))
+            for frame in can.LogReader(self.frames)
+            if 1 <= frame.arbitration_id <= JOINTS
+        ]
+
+    def speeds(self, since_s: float) -> NDArray[np.float64]:
+        """Return the measured speeds of all joints from a time on, rad/s."""
+        speeds = []
+        for frame in can.LogReader(self.frames):
+            motor = frame.arbitration_id - 0x10
+            if 1 <= motor <= JOINTS and frame.timestamp > since_s and is_feedback(bytes(frame.data), motor):
+                ranges = MOTORS["DM8009" if motor <= 2 else "DM4340" if motor <= 4 else "DM4310"]
+                speeds.append(decode_feedback(bytes(frame.data), ranges).velocity)
+        return np.array(speeds)
+
+
+class Heard(NamedTuple):
+    """A frame that reached a joint's drive."""
+
+    at_s: float
+    """By the drives' own clock, which stands still while the emulator does not get to run."""
+    motor: int
+    kind: str
+    """track, damp, or the special command's name."""
+
+
+def _kind(data: bytes) -> str:
+    if data[:7] == b"\xff" * 7:
+        return Special(data[7]).name
+    return "track" if int.from_bytes(data, "big") >> 24 & 0xFFF else "damp"
 
 
 def _children(pid: int) -> list[int]:

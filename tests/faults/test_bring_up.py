@@ -25,11 +25,12 @@ def test_a_planted_mistake_is_named(start: Any, tmp_path: Path, options: list[st
     emulator = Emulator(tmp_path, *options)
     try:
         run = start("--backend", "can", "--robot", "openarm", "--channel", emulator.channel)
-        status, output, _ = run.finish()
+        status, output, report = run.finish()
     finally:
-        emulator.process.kill()
-        emulator.process.wait()
+        emulator.end()
     assert status == 4, output
+    assert report["safety"]["state"] == "OFF"
+    assert words[0] in report["error"]
     for word in words:
         assert word in output, output
     assert "Traceback" not in output

@@ -51,10 +51,14 @@ def test_a_killed_control_process_ends_the_run_as_lost_hardware(start: Any, mome
     pids = run.wait_running()
     time.sleep(moment)
     os.kill(pids["control"], signal.SIGKILL)
-    status, output, _ = run.finish()
+    status, output, report = run.finish()
     assert status == 4, output
     assert "the control process was killed by signal 9" in output
-    assert "watchdog" in output
+    assert report["error"].startswith("the control process was killed by signal 9")
+    assert [(trip["protection"], trip["stop_category"]) for trip in report["safety"]["trips"]] == [("P27", 0)]
+    assert report["safety"]["state"] == "FAULT"
+    assert report["timing"]["ticks"] > 500
+    assert report["black_boxes"]
     assert run.left_behind() == []
 
 

@@ -20,18 +20,19 @@ LOST = re.compile(r"(\S+): ENABLED -> COMMUNICATION_LOST, (\d+) ms after the las
 def emulator(tmp_path: Path) -> Iterator[Emulator]:
     emulator = Emulator(tmp_path)
     yield emulator
-    emulator.process.kill()
-    emulator.process.wait()
+    emulator.end()
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_every_motor_goes_off_by_itself_when_control_is_killed(start: Any, emulator: Emulator, moment: float) -> None:
+def test_every_motor_goes_off_by_itself_when_nobody_is_left(start: Any, emulator: Emulator, moment: float) -> None:
     run = start("--backend", "can", "--robot", "openarm", "--channel", emulator.channel, "--policy", "random")
     pids = run.wait_running()
     time.sleep(moment)
-    os.kill(pids["control"], signal.SIGKILL)
-    status, output, _ = run.finish()
+    for part in ("watchman", "control"):
+        os.kill(pids[part], signal.SIGKILL)
+    status, output, report = run.finish()
     assert status == 4, output
+    assert "the drives go off by their own watchdogs" in report["error"]
     time.sleep(0.3)
     lost = {joint: int(ms) for joint, ms in LOST.findall(emulator.text)}
     assert len([joint for joint in lost if joint != "gripper"]) == 7, emulator.text
