@@ -33,9 +33,15 @@ _POLL_PERIOD_NS = 3_500_000
 _LEAST_DAMPING = 0.5
 """Nms/rad of the motor in DAMP, where a profile's kd is smaller: damping has to stop an arm without brakes."""
 
-_BUS_OFF = Fault(
-    "bus", 0x40, "BUS_OFF", "the controller left the bus after too many errors; check cable and termination"
-)
+_BUS_FAULTS = {
+    "bus-off": Fault(
+        "bus", 0x40, "BUS_OFF", "the controller left the bus after too many errors; check cable and termination"
+    ),
+    "passive": Fault(
+        "bus", 0x20, "ERROR_PASSIVE", "the controller sees too many errors; check cable, termination and bit rates"
+    ),
+}
+"""What the states of a controller in trouble mean to a person."""
 
 
 class DamiaoArm(Arm):
@@ -233,8 +239,8 @@ class DamiaoArm(Arm):
         for drive in self._drives:
             if drive.status > 1:
                 faults += (fault_of(drive.name, drive.status),)
-        if transport.state == "bus-off":
-            faults += (_BUS_OFF,)
+        if transport.state in _BUS_FAULTS:
+            faults += (_BUS_FAULTS[transport.state],)
         return Sample(
             now,
             np.array([drive.position for drive in joints]),
