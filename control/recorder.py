@@ -197,6 +197,7 @@ class RecorderProcess:
         if self._summary is not None:
             return self._summary
         process = self._process
+        process.send_signal(signal.SIGCONT)  # one that was suspended has all of the ring to catch up with
         try:
             # A byte, too: a forked child of ours may hold the pipe open.
             words, _ = process.communicate(b"\n", timeout=timeout_s)

@@ -1,6 +1,9 @@
 """A session in a process of its own, around a control process that is busy when it is asked to end, or fails."""
 
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +13,7 @@ import pytest
 from robotctl.control import registry
 from robotctl.control.loop import Verb
 from robotctl.control.process_session import ProcessSession
+from robotctl.control.shared import Board
 from robotctl.hal.errors import HardwareError
 from robotctl.hal.robot import Robot
 from robotctl.safety.machine import State
@@ -147,3 +151,26 @@ def test_a_bug_with_the_drives_off_leaves_nothing_to_take(
             session.advance(5.0)
         assert session.trips == []
         assert not (tmp_path / "taken").exists()
+
+
+def test_neither_a_reader_that_stands_still_nor_memory_that_is_closed_holds_the_loop_up(
+    panda: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROBOTCTL_RUNTIME_DIR", str(tmp_path))
+    with ProcessSession(panda, "sim") as session:
+        fd, slots = Board.read_only(session.fds[1]), session.link.ticks.slots
+        source = f"from robotctl.control.shared import Board; board = Board.attach({fd}, 7, {slots}); print(flush=True)"
+        command = [sys.executable, "-c", source + "\nwhile True: board.ticks.since(0)"]
+        with subprocess.Popen(command, pass_fds=[fd], stdout=subprocess.PIPE) as viewer:
+            assert viewer.stdout is not None
+            viewer.stdout.readline()
+            viewer.send_signal(signal.SIGSTOP)
+            for mine in (fd, *session.fds):
+                os.close(mine)
+            session.link.fds = None
+            session.request(Verb.ARM)
+            before = session.link.ticks.head
+            session.advance(1.0)
+            assert session.link.ticks.head - before > 400
+            assert session.state is State.ARMED
+            viewer.kill()

@@ -159,6 +159,18 @@ def test_board_of_the_recorder_cannot_be_written(writer):
         os.close(fd)
 
 
+def test_suspended_recorder_loses_what_was_overwritten_and_says_so(start):
+    writer = Writer(slots=500)
+    recorder = start(writer)
+    writer.tick(100)
+    wait_for_ticks(recorder.path)
+    os.kill(recorder.pid, signal.SIGSTOP)
+    writer.tick(2000)
+    summary = recorder.stop()
+    assert (summary["recorded"], summary["dropped"]) == (100 + 436, 2000 - 436)
+    assert ticks_in(recorder.path) == [*range(100), *range(2100 - 436, 2100)]
+
+
 def test_full_disk_ends_the_recorder_with_one_line(writer, start):
     recorder = start(writer)
     wait_until(lambda: recorder.path.exists() and recorder.path.stat().st_size > 0)

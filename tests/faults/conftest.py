@@ -33,7 +33,8 @@ class Run:
         self.folder = folder
         self.report_path = folder / "report.json"
         self.environment = os.environ | {"ROBOTCTL_RUNTIME_DIR": str(folder)}
-        files = ["--json", str(self.report_path), "--record", str(folder / "run.mcap")]
+        files = ["--json", str(self.report_path)]
+        files += [] if "--record" in arguments else ["--record", str(folder / "run.mcap")]
         self.process = subprocess.Popen(
             [*ROBOTCTL, "run", *arguments, *files],
             env=self.environment,

@@ -115,6 +115,17 @@ def test_a_hostile_policy_is_clipped_but_harms_nothing(name, backend, policy):
     assert made["safety"]["state"] == "READY"
 
 
+def test_ticks_that_were_overwritten_unread_are_in_the_report():
+    with LockstepSession(load_robot("panda"), "sim") as session:
+        slots = session.link.ticks.slots
+        for _ in range(slots + 100):
+            session.clock.sleep_until(session.clock.now_ns() + session.robot.period_ns)
+            session.loop.tick()
+        timing = report(session, Outcome(), {}, SessionRecording(Path("none.mcap")))["timing"]
+        assert timing["ticks"] == session.link.ticks.head
+        assert timing["dropped"] == session.link.ticks.head - slots + 64
+
+
 def test_an_arm_that_does_not_follow_ends_the_run_and_says_why():
     task = load_task("reach")
     with LockstepSession(load_robot("panda"), "sim") as session:
