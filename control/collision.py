@@ -22,8 +22,8 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector, frozen
 from robotctl.safety.region import rotation
 
-_OPENINGS = (0.0, 0.5, 1.0)
-"""Of the gripper, at which its fingers are added to their hulls."""
+_OPENINGS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Of the gripper, at which its fingers are added to their hulls; between them they bulge by less than a millimetre."""
 _BASE = 0
 """Pinocchio's joint of all that does not move."""
 _MESHES = coal.CachedMeshLoader()

@@ -2,7 +2,7 @@
 
 Each tells the room h(p) that is left, and the row that lets the tool approach its surface only as fast as that
 allows. With n the direction in which room shrinks fastest, dh/dt = -n J v, and the row reads n J v <= k h: a control
-barrier function of relative degree one. Outside (h < 0) the same row demands a way back, at k |h|.
+barrier function of relative degree one. Outside (h < 0) the same row asks for a way back, at k |h|.
 """
 
 import math
@@ -31,7 +31,7 @@ class Row(NamedTuple):
 
     @staticmethod
     def keeping(room: float, gain: float, normal: Vector) -> "Row":
-        """Return the row that lets room shrink by `gain` times itself, m/s, or demands its return where it is negative.
+        """Return the row that lets room shrink by `gain` times itself, m/s, or asks for its return where it is negative.
 
         Args:
             normal: how fast room shrinks with each joint (n,), m/rad.

@@ -33,6 +33,8 @@ _SAMPLES = np.array([[0.25], [0.5], [0.75], [1.0]])
 """Where along the time to rest a predicted stop is looked at."""
 _ROUNDING = 1e-9
 """m"""
+_SINGULAR = 1e-6
+"""Square of a row's normal below which it moves nothing, m^2."""
 
 
 class ToolModel(Protocol):
@@ -191,8 +193,16 @@ class Shaper:
         return Shaped(self._solve(wanted, lower, upper, [row for row, _ in rows]) if broken else best, clip)
 
     def _solve(self, wanted: Vector, lower: Vector, upper: Vector, rows: list[Row]) -> Vector:
+        """Return the velocity in the box closest to the wanted one that keeps all rows.
+
+        Of a row with a negative bound, whose room is used up, no more is demanded than to get no worse, or two of them
+        could ask for what cannot be had. The way back is wanted: the wish is changed to go at the bound.
+        """
+        for normal, bound in rows:
+            if bound < min(0.0, float(normal @ wanted)):
+                wanted = wanted - normal * ((normal @ wanted - bound) / (normal @ normal + _SINGULAR))
         normals = np.array([row.normal for row in rows])
-        most = np.concatenate([upper, [row.bound for row in rows]])
+        most = np.concatenate([upper, [max(0.0, row.bound) for row in rows]])
         least = np.concatenate([lower, np.full(len(rows), -1e30)])
         for sense in self._senses:
             solution, _, flag, _ = daqp.solve(self._hessian, -wanted, normals, most, least, sense[: len(most)])
