@@ -474,7 +474,7 @@ def test_a_malformed_target_stops_at_once_and_three_end_in_a_fault():
 
 @pytest.mark.parametrize(
     ("protection", "recovers"),
-    [(p, p in (Protection.POSITION, Protection.SPHERE)) for p in Protection],
+    [(p, p in (Protection.POSITION, Protection.SPHERE, Protection.PROXIMITY)) for p in Protection],
     ids=[p.name for p in Protection],
 )
 def test_acknowledging_a_breach_permits_only_the_retreat(protection, recovers):
