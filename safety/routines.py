@@ -22,6 +22,9 @@ _GAIN = 3.0
 _ARRIVED = 2e-3
 """rad"""
 _RETREAT_SCALE = 0.1
+"""Part of the caps that a retreat uses at most."""
+_CRAWL = 0.2
+"""Part of that which it uses at least, so that the end is reached."""
 _RETREAT_DEPTH = 0.01
 """How far inside a boundary a retreat ends, m and rad."""
 _RETREAT_CLEARANCE = 2e-3
@@ -92,9 +95,8 @@ class Retreat(Routine):
             wanted = wanted - slope * (_GAIN * (self._clear - clearances[pair]) / (slope @ slope + 1e-3))
         if float(np.abs(inside - position).max()) < _ARRIVED and outside < 0.2 * _RETREAT_DEPTH and not tight:
             return None
-        # At least a crawl, so that the end is reached.
         fastest = float((np.abs(wanted) / self._cap).max())
-        return wanted / max(1.0, fastest) if fastest > 0.2 else wanted * (0.2 / max(fastest, 1e-9))
+        return wanted * (min(max(fastest, _CRAWL), 1.0) / fastest) if fastest > 0.0 else wanted
 
 
 class Goto(Routine):

@@ -5,8 +5,10 @@ tests fail on the unchanged modules or the command line is wrong.
 """
 
 import argparse
+import gc
 import os
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -41,17 +43,20 @@ def main() -> int:
     if only not in {None, *package.trees}:
         parser.error(f"{only} is no file of safety/")
     began = time.monotonic()
+    gc.freeze()  # a fork's collector need not look through what it inherits
     try:
-        seen = campaign.survey(package)
-        todo = campaign.cases(package, seen, only)
-        if options.mutant:
-            return show_one(package, seen, todo, options.mutant)
-        print(f"{len(todo)} mutants, {len(seen.durations)} tests of {sum(seen.durations.values()):.0f} s", flush=True)
-        done = []
-        for case in campaign.run(package, seen, todo, options.jobs):
-            done.append(case)
-            if sys.stderr.isatty():
-                print(f"{len(done)} of {len(todo)}", end="\r", file=sys.stderr)
+        with tempfile.TemporaryDirectory() as compiled:
+            sys.pycache_prefix, sys.dont_write_bytecode = compiled, False  # the forks import the same files
+            seen = campaign.survey(package)
+            todo = campaign.cases(package, seen, only)
+            if options.mutant:
+                return show_one(package, seen, todo, options.mutant)
+            print(f"{len(todo)} mutants, {len(seen.durations)} tests", flush=True)
+            done = []
+            for case in campaign.run(package, seen, todo, options.jobs):
+                done.append(case)
+                if len(done) % 100 == 0:
+                    print(f"{len(done)} of {len(todo)}", flush=True)
     except campaign.UnmutatedTestsFail:
         print("the tests fail on the unchanged modules; look with: python -m pytest tests/safety", file=sys.stderr)
         return 2

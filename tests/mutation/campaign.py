@@ -240,8 +240,8 @@ def _contexts(data: coverage.CoverageData, path: Path) -> dict[int, list[str]]:
 
 def _pytest(package: Package, where: list[str], plugin: object) -> int:
     hypothesis.settings.load_profile("mutation")
-    options = ["-x", "-q", "--tb=short", "-p", "no:cacheprovider", "-p", "no:xdist", f"--rootdir={package.root}"]
-    return pytest.main([*options, *where], plugins=[plugin])
+    off = [f"-pno:{name}" for name in ("cacheprovider", "unraisableexception", "xdist")]  # the second collects garbage
+    return pytest.main(["-x", "-q", "--tb=short", f"--rootdir={package.root}", *off, *where], plugins=[plugin])
 
 
 class _Selection:

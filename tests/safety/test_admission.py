@@ -80,6 +80,18 @@ def test_three_malformed_targets_in_a_second_are_a_fault(admission: Admission) -
     assert categories == [Category.BRAKE_HOLD, Category.BRAKE_HOLD, Category.BRAKE_OFF]
 
 
+@pytest.mark.parametrize(
+    ("third_ns", "category"),
+    [(1000 * MS, Category.BRAKE_OFF), (1000 * MS + 1, Category.BRAKE_HOLD)],
+)
+def test_the_second_counts_from_the_first_of_three(admission: Admission, third_ns: int, category: Category) -> None:
+    began = 5000 * MS
+    trips = [admission.offer(velocity(np.zeros(6)), 0, began + at) for at in (0, 500 * MS, third_ns)]
+    assert trips[-1].category is category  # type: ignore[union-attr]
+    assert ("3 times within 1 s" in trips[-1].cause) is (category is Category.BRAKE_OFF)  # type: ignore[union-attr]
+    assert "times within" not in trips[0].cause  # type: ignore[union-attr]
+
+
 def test_malformed_targets_far_apart_are_not(admission: Admission) -> None:
     bad = np.full(7, np.nan)
     categories = [admission.offer(velocity(bad), 0, at * MS).category for at in (0, 600, 1200)]  # type: ignore[union-attr]
@@ -125,6 +137,14 @@ def test_the_heartbeat_names_its_onset(admission: Admission) -> None:
     assert trip is not None
     assert trip.onset_ns == 100 * MS
     assert trip.category is Category.BRAKE_HOLD
+
+
+def test_before_the_first_target_there_is_none_and_none_is_awaited(admission: Admission) -> None:
+    assert admission.fresh(-1) is None
+    assert admission.heartbeat(-1) is None
+    trip = admission.heartbeat(0)
+    assert trip is not None
+    assert "for 100 ms" in trip.cause
 
 
 @pytest.mark.parametrize("kind", [Hold, FreeDrive])

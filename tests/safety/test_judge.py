@@ -37,6 +37,10 @@ def plant(records, index, key, excess, prefix="true_"):
 BOUNDS = {"position": POSITION_BOUND, "velocity": ROBOT.profile.safety.velocity_tolerance, "sphere": REGION_BOUND}
 
 
+def test_the_bounds_are_half_a_milliradian_and_two_millimetres():
+    assert (POSITION_BOUND, REGION_BOUND) == (0.5e-3, 2e-3)
+
+
 def test_a_clean_run_has_none():
     judge = Judge(ROBOT)
     judge.take(clean(100))
@@ -123,6 +127,16 @@ def test_the_truth_counts_where_it_is_known_and_the_measurement_elsewhere():
         assert judge.violations["velocity"] == (1 if has_truth else 0)
         assert judge.violations["sphere"] == (0 if has_truth else 1)
         assert judge.on_truth is has_truth
+
+
+def test_a_portion_with_some_truth_is_judged_on_what_was_measured():
+    records = clean(3)
+    records["has_truth"][1] = False
+    plant(records, 0, "sphere", 1.0, prefix="")
+    judge = Judge(ROBOT)
+    judge.take(records)
+    assert judge.violations["sphere"] == 1
+    assert not judge.on_truth
 
 
 def test_one_portion_without_truth_shows_in_the_verdict():

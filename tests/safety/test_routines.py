@@ -174,6 +174,78 @@ def test_retreat_has_nothing_to_do_inside(robot: Robot, kinematics: Kinematics):
     assert Retreat(robot, kinematics).velocity(sample(home), home) is None
 
 
+class Slide:
+    """The first joint slides the tool along x, a metre per radian, from `start`."""
+
+    def __init__(self, start) -> None:
+        self._start = np.array(start)
+
+    def tool_and_jacobian(self, position):
+        jacobian = np.zeros((3, len(position)))
+        jacobian[0, 0] = 1.0
+        return self._start + position[0] * jacobian[:, 0], jacobian
+
+
+SPHERE = load_robot("panda").profile.sphere
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(
+    ("beyond", "speed"),  # past where the retreat ends, rad; and the speed of that, rad/s
+    [(0.5, 0.1), (0.034, 0.1), (0.03, 0.09), (0.01, 0.03), (0.006, 0.02), (0.0021, 0.02), (0.0019, None)],
+)
+def test_a_joint_retreats_in_proportion_between_a_crawl_and_a_tenth_of_its_cap(panda: Robot, side, beyond, speed):
+    end = (panda.limits.upper[1] if side > 0 else -panda.limits.lower[1]) - panda.profile.safety.position_margin - 0.01
+    position = np.array(panda.profile.home)
+    position[1] = side * (end + beyond)
+    wanted = Retreat(panda, Slide(SPHERE.centre)).velocity(sample(position), position)
+    if speed is None:
+        assert wanted is None
+    else:
+        assert wanted == pytest.approx([0.0, -side * speed, 0.0, 0.0, 0.0, 0.0, 0.0], abs=1e-12)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(
+    ("beyond", "speed"),  # past where the retreat ends, m
+    [(0.5, 0.1), (0.03, 0.09 / 1.001), (0.01, 0.03 / 1.001), (0.006, 0.02), (0.0021, 0.02), (0.0019, None)],
+)
+def test_so_does_the_tool(panda: Robot, side, beyond, speed):
+    """The damped inverse of a Jacobian of length 1 is 1/1.001 long."""
+    position = np.array(panda.profile.home)
+    out = SPHERE.radius - panda.profile.safety.sphere_margin - 0.01 + beyond
+    slide = Slide(np.array(SPHERE.centre) + side * np.array([out, 0.0, 0.0]))
+    wanted = Retreat(panda, slide).velocity(sample(position), position)
+    if speed is None:
+        assert wanted is None
+    else:
+        assert wanted == pytest.approx([-side * speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], abs=1e-12)
+
+
+def test_a_retreat_that_knows_no_way_stays_where_it_is(panda: Robot):
+    position = np.array(panda.profile.home)
+    above = np.array(SPHERE.centre) + np.array([0.0, 0.0, 1.0])  # the slide moves the tool along x only
+    assert not Retreat(panda, Slide(above)).velocity(sample(position), position).any()
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(("error", "speed"), [(0.01, 0.03), (0.5, 0.3)])
+def test_goto_slows_down_in_proportion_and_keeps_to_its_share_of_the_caps(panda: Robot, side, error, speed):
+    pose = np.array(panda.profile.home)
+    position = pose.copy()
+    position[1] -= side * error
+    wanted = Goto(panda, pose, "home", Slide(SPHERE.centre)).velocity(sample(position), position)
+    assert wanted == pytest.approx([0.0, side * speed, 0.0, 0.0, 0.0, 0.0, 0.0], abs=1e-12)
+
+
+def test_names_and_times_after_which_a_routine_has_failed(panda: Robot):
+    slide = Slide(SPHERE.centre)
+    assert (Settle(panda).name, Settle(panda).timeout_s) == ("settle", 2.0 + panda.stopping_time_s)
+    assert (Retreat(panda, slide).name, Retreat(panda, slide).timeout_s) == ("retreat", 30.0)
+    goto = Goto(panda, np.array(panda.profile.home), "home", slide)
+    assert (goto.name, goto.timeout_s) == ("home", 60.0)
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 def test_settle_waits_for_every_measured_joint(robot: Robot, side):
     routine = Settle(robot)
