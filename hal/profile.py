@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 CLASSIC_HZ = 250
 """Highest servo rate of eight drives on classic CAN at 1 Mbit/s: 2.2 ms of wire time per cycle."""
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 Point = tuple[Finite, Finite, Finite]
 Range = tuple[Finite, Finite]
 
@@ -39,9 +39,9 @@ class Drive(_Strict):
     motor angle = sign * gear * (joint angle - offset)
     """
 
-    id: Annotated[int, Field(ge=1, le=0x7F)]
+    id: Annotated[int, Field(strict=True, ge=1, le=0x7F)]
     """ESC_ID, the id the motor listens to."""
-    reply_id: Annotated[int, Field(ge=1, le=0x7FF)]
+    reply_id: Annotated[int, Field(strict=True, ge=1, le=0x7FF)]
     """MST_ID, the id it answers with."""
     motor: str
     """Model, e.g. DM8009; its full-scale ranges are verified against the drive."""

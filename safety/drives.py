@@ -21,6 +21,10 @@ class BusHealth:
         """Take note of whether a command left the host."""
         self._undelivered = 0 if delivered else self._undelivered + 1
 
+    def forget(self) -> None:
+        """Begin anew: the drives are off."""
+        self._undelivered = 0
+
     def check(self, sample: Sample) -> Trip | None:
         for fault in sample.faults:
             if fault.joint == BUS:

@@ -34,14 +34,19 @@ class JointGuard:
         self._bump = safety.bump
         self._tolerance = safety.velocity_tolerance
         self._last: Asked | None = None
+        self._excess = math.inf
+        """Least that braking ended past a soft limit since the joint is led, rad; negative inside."""
 
     def forget(self) -> None:
         """Start anew: the drive is off."""
         self._last = None
+        self._excess = math.inf
 
     def keep(self, asked: Asked) -> None:
         """Compare the next message with this one, which was let through."""
         self._last = asked
+        excess = self._stop_excess(asked.position, asked.velocity)
+        self._excess = min(self._excess, excess) if asked.kind is Kind.TRACK else math.inf
 
     def refuse(
         self, asked: Asked, step: Step, position: float, velocity: float, seconds: float, *, standing: bool
@@ -83,7 +88,7 @@ class JointGuard:
             return self._refusal(Protection.VELOCITY, f"{target - last.position:+.4f} rad at once")
         if abs(speed - last.velocity) > self._acceleration * seconds + 2.0 * step.velocity:
             return self._refusal(Protection.ACCELERATION, f"{speed - last.velocity:+.3f} rad/s at once")
-        return self._refuse_stop(asked, step, last.position, last.velocity)
+        return self._refuse_stop(asked, step, self._excess)
 
     def _refuse_start(
         self, asked: Asked, step: Step, position: float, velocity: float, seconds: float
@@ -99,15 +104,15 @@ class JointGuard:
         jump = abs(asked.velocity - max(-self._velocity, min(velocity, self._velocity)))
         if not jump <= self._acceleration * seconds + self._tolerance + step.velocity:
             return self._refusal(Protection.BUMP, f"start at {asked.velocity:.3f} rad/s, measured {velocity:.3f}")
-        return self._refuse_stop(asked, step, position, velocity)
+        return self._refuse_stop(asked, step, self._stop_excess(position, velocity))
 
-    def _refuse_stop(self, asked: Asked, step: Step, position: float, velocity: float) -> Refusal | None:
+    def _refuse_stop(self, asked: Asked, step: Step, before: float) -> Refusal | None:
         """Refuse a motion whose braking ends past a soft limit, and further out than from where it comes."""
         excess = self._stop_excess(asked.position, asked.velocity)
         if excess <= 0.0:
             return None
         rounding = step.position + step.velocity * (abs(asked.velocity) + step.velocity) / self._braking
-        if excess > max(self._stop_excess(position, velocity), 0.0) + 2.0 * rounding + _NUMERIC:
+        if excess > max(before, 0.0) + 2.0 * rounding + _NUMERIC:
             return self._refusal(Protection.SOFT_LIMIT, f"{asked.position:.3f} rad at {asked.velocity:.3f} rad/s")
         return None
 

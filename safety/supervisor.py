@@ -89,6 +89,7 @@ class Supervisor:
                 self._raise_epoch(None)
                 if event is Event.ARM:
                     self._believable.forget()
+                    self.bus.forget()
                 elif event is Event.ACK:
                     self.recovery = self.cause is not None and self.cause.protection in _RECOVERABLE
                 elif event is Event.RESET_DONE:

@@ -5,6 +5,7 @@ the plant itself, a seized joint or a push, needs neither: see `Plant.jam`, `Pla
 """
 
 from collections.abc import Callable, Iterable
+from math import inf
 
 import numpy as np
 
@@ -88,6 +89,9 @@ class TroubledArm(Arm):
 
     def close(self) -> None:
         self.arm.close()
+
+    def take_over(self, command: Command) -> None:
+        self.arm.take_over(command)
 
     def truth(self) -> Truth | None:
         return self.arm.truth()
@@ -182,12 +186,15 @@ class Lose(Trouble):
 
 
 class Garble(Trouble):
-    """Commands are altered on their way to the arm, as by a bug of whatever made them."""
+    """Some commands are altered on their way to the arm, as by a bug of whatever made them."""
 
-    def __init__(self, alter: Callable[[Command], Command]) -> None:
+    def __init__(self, alter: Callable[[Command], Command], times: float = inf) -> None:
         self._alter = alter
+        self._times = times
 
     def on_write(self, command: Command) -> Command | Sent:
+        if self.acted >= self._times:
+            return command
         self.acted += 1
         return self._alter(command)
 

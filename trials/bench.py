@@ -48,6 +48,8 @@ class Bench:
         self.arm = TroubledArm(self._rig.arm)
         self.loop = Loop(robot, Rig(self.arm, self._rig.gripper), self.clock, self.link)
         self.policy: Policy | None = None
+        self.attended = False
+        """Whether the operator's process shows that it is alive."""
         self.trips: list[dict[str, Any]] = []
         self._answers: dict[int, str] = {}
         self._events = 0
@@ -58,8 +60,7 @@ class Bench:
 
     def __enter__(self) -> Self:
         self.loop.bring_up()
-        self.plant.place(np.array(self.robot.profile.home))
-        self.tick()
+        self.place(np.array(self.robot.profile.home))
         return self
 
     def __exit__(
@@ -119,14 +120,24 @@ class Bench:
         self.clock.sleep_until(self.now_ns + round((1.0 + late - self._late) * period))
         self.loop.lateness_ns, self.loop.skipped = round(late * period), int(late)
         self._late = late % 1.0
+        if self.attended:
+            self.link.desk.beat()
         if self.policy is not None and self.now_ns >= self._due_ns:
             self._due_ns += round(POLICY_S * 1e9)
             target = self.policy(self, (self.now_ns - self._begun_ns) * 1e-9)
             if target is not None:
                 self.link.mailbox.put(target)
         self.loop.tick()
-        self._take_events()
+        self.take_events()
         return self.state
+
+    def let_pass(self, nanoseconds: int) -> None:
+        """Let time pass without a tick: the plant and its drives go on by themselves."""
+        self.clock.sleep_until(self.now_ns + nanoseconds)
+        if self.twin:
+            self.twin.read()
+        else:
+            self.motors.advance(self.now_ns)
 
     def run(self, seconds: float) -> State:
         """Tick for some time."""
@@ -165,6 +176,11 @@ class Bench:
         if text:
             raise HardwareError(f"{verb.name} was refused: {text}")
 
+    def place(self, pose: Vector) -> None:
+        """Put an arm whose drives are off somewhere, and let the loop see it."""
+        self.plant.place(pose)
+        self.run(_SETTLE_S)
+
     def start(self, policy: Policy) -> None:
         """Arm, and hand the arm to a policy."""
         self.demand(Verb.ARM)
@@ -191,7 +207,8 @@ class Bench:
         records, _, _ = self.link.ticks.since(0)
         return records[records["stamp_ns"] >= stamp_ns]
 
-    def _take_events(self) -> None:
+    def take_events(self) -> None:
+        """Take in what the loop has told since the last tick."""
         events, self._events = self.link.events.since(self._events)
         for event in events:
             if event["type"] == "answer":

@@ -34,8 +34,8 @@ def go_on(bench: Bench, planted: Planted, clears: Clears, trial: Trial) -> None:
         cycle_power(bench)
     if clears is not Clears.START:
         _acknowledge(bench, trial)
-    if clears is Clears.RETREAT and not trial.problems:
-        _retreat(bench, trial)
+    if clears is Clears.RETREAT:
+        trial.require(bench.loop.supervisor.recovery, "the arm may go on from outside its limits")
     if not trial.problems:
         _move(bench, trial)
         trial.seen += f", cleared {clears.value}"
@@ -74,6 +74,8 @@ def _retreat(bench: Bench, trial: Trial) -> None:
 
 
 def _move(bench: Bench, trial: Trial) -> None:
+    if bench.loop.supervisor.recovery:  # it came to rest a little outside, and was not to go on from there
+        _retreat(bench, trial)
     trips = len(bench.trips)
     bench.hand_over(sway(bench))
     bench.run(0.3)

@@ -103,6 +103,33 @@ def teleported(bench: Bench, pose: Vector) -> Planted:
     return Planted(lambda: None, lambda: bool(np.abs(bench.since(begun)["true_position"] - before).max() > 0.9 * way))
 
 
+def pulled(bench: Bench, pose: Vector, seconds: float) -> Planted:
+    """Somebody pulls the arm to a pose (n,), rad, and lets go once it is stopped."""
+    before, begun, plant = bench.plant.truth().position, bench.now_ns, bench.plant
+
+    class Pull(twin.Trouble):
+        def on_plant(self) -> None:
+            if not bench.trips:
+                self.acted += 1
+                part = min((bench.now_ns - begun) / (seconds * 1e9), 1.0)
+                plant.place(before + part * (pose - before))
+
+    return between(bench, Pull())
+
+
+def driven(bench: Bench, axis: int, speed: float) -> Planted:
+    """Something drives a joint at a speed, rad/s, for 20 ms, stronger than its drive."""
+    ends, plant = bench.now_ns + 20_000_000, bench.plant
+
+    class Drive(twin.Trouble):
+        def on_plant(self) -> None:
+            if bench.now_ns < ends:
+                self.acted += 1
+                plant.data.qvel[axis] = speed
+
+    return between(bench, Drive())
+
+
 # -- in the drives -----------------------------------------------------------------------------------------------------
 
 

@@ -8,6 +8,7 @@ from robotctl.hal.types import Vector
 
 _ATTEMPTS = 200
 _STEP = 1e-3
+_CLOSE = 0.04
 
 
 def outside(robot: Robot, kinematics: Kinematics, pose: Vector) -> float:
@@ -55,6 +56,6 @@ def at_sphere(robot: Robot, rng: np.random.Generator, distances: tuple[float, fl
                 ascent = jacobian.T @ (tool - centre)
                 step = _STEP * ascent / max(float(np.linalg.norm(ascent)), 1e-9)
                 pose = np.clip(pose + step, robot.limits.lower + margin, robot.limits.upper - margin)
-        if len(found) == 2:
+        if len(found) == 2 and np.abs(found[1] - found[0]).max() < _CLOSE:
             return found[0], found[1]
     raise ValueError(f"{robot.profile.name}: the tool does not reach its sphere")

@@ -9,20 +9,27 @@ from robotctl.safety.machine import State
 from robotctl.trials.bench import Bench
 from robotctl.trials.faults import Fault
 from robotctl.trials.scenario import Scenario, Trial
-from robotctl.trials.stops import judge_limits, running
+from robotctl.trials.stops import Start, judge_limits, running
 
 _AFTER_S = 1.0
 
 
 def resuming_scenario(
-    number: int, name: str, provoked: str, fault: Fault, seconds: float, trips: Sequence[str] = ()
+    number: int,
+    name: str,
+    provoked: str,
+    fault: Fault,
+    seconds: float,
+    trips: Sequence[str] = (),
+    start: Start = running,
+    repeats: int = 3,
 ) -> Scenario:
     """Return the scenario of a fault that lasts for `seconds`, with the protections that may trip meanwhile."""
 
     def run(robot: Robot, backend: str, seed: int) -> Trial:
         trial = Trial()
         with Bench(robot, backend, seed) as bench:
-            running(bench)
+            start(bench)
             onset = bench.now_ns
             planted = fault(bench)
             bench.run(seconds)
@@ -40,4 +47,4 @@ def resuming_scenario(
         judge_limits(robot, records, frozenset(), trial)
         return trial
 
-    return Scenario(number, name, provoked, "braked; goes on by itself once the cause is gone", run)
+    return Scenario(number, name, provoked, "braked; goes on by itself once the cause is gone", run, repeats)

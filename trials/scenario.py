@@ -35,6 +35,7 @@ TITLES = {
     27: "watchman",
     28: "log, disk, viewer",
     29: "failed reset",
+    30: "operator's process",
 }
 """All protections by number. Each has to have a scenario, on every robot and backend."""
 

@@ -11,11 +11,12 @@ from robotctl.hal.types import Vector
 from robotctl.safety.machine import State
 from robotctl.safety.shaper import Clip
 from robotctl.trials.bench import Bench, Policy
+from robotctl.trials.faults import Fault
 from robotctl.trials.policies import Act, velocities
 from robotctl.trials.scenario import Scenario, Trial
-from robotctl.trials.stops import judge_limits
+from robotctl.trials.stops import judge_limits, running
 
-_SECONDS = 6.0
+_SECONDS = 4.0
 
 Pace = Callable[[Bench], float]
 """How late the next tick is, in servo periods."""
@@ -47,7 +48,7 @@ def shaped_scenario(
     def run(robot: Robot, backend: str, seed: int) -> Trial:
         trial = Trial()
         with Bench(robot, backend, seed) as bench:
-            bench.plant.place(start(bench))
+            bench.place(start(bench))
             bench.start(targets(act(robot, bench.random)))
             begun = bench.now_ns
             while bench.now_ns - begun < _SECONDS * 1e9 and not bench.trips:
@@ -58,6 +59,27 @@ def shaped_scenario(
         judge_limits(robot, records, frozenset(), trial)
         judge_commands(robot, records, trial)
         trial.seen = "shaped, no stop"
+        return trial
+
+    return Scenario(number, name, provoked, "no stop, no limit exceeded", run)
+
+
+def tolerated_scenario(number: int, name: str, provoked: str, fault: Fault) -> Scenario:
+    """Return the scenario of a fault that must change nothing."""
+
+    def run(robot: Robot, backend: str, seed: int) -> Trial:
+        trial = Trial()
+        with Bench(robot, backend, seed) as bench:
+            running(bench)
+            onset = bench.now_ns
+            planted = fault(bench)
+            bench.run(_SECONDS)
+            records = bench.since(onset)
+            trial.require(planted.showed(), "the fault did not show: it was not there")
+        moving = float((np.abs(records["true_velocity"]) / robot.limits.velocity).max(axis=1).mean())
+        trial.require(bench.state is State.RUN and moving > 0.1, f"ended in {bench.state.name}: {bench.trips}")
+        judge_limits(robot, records, frozenset(), trial)
+        trial.seen = "went on"
         return trial
 
     return Scenario(number, name, provoked, "no stop, no limit exceeded", run)

@@ -46,6 +46,17 @@ def test_five_commands_in_a_row_that_do_not_leave_stop_the_arm():
     assert "5 commands in a row" in trip.cause
 
 
+def test_what_did_not_leave_before_the_drives_went_off_is_forgotten():
+    bus = BusHealth()
+    for _ in range(5):
+        bus.sent(delivered=False)
+    bus.forget()
+    assert bus.check(sample()) is None
+    for _ in range(4):
+        bus.sent(delivered=False)
+    assert bus.check(sample()) is None
+
+
 def test_a_drives_fault_stops_the_arm_and_is_named(panda: Robot):
     check = DriveHealth(panda)
     assert check.check(sample()) is None

@@ -184,6 +184,35 @@ def test_a_stop_is_judged_within_the_resolution(side, limit, step):
 
 
 @pytest.mark.parametrize(("side", "limit"), [(-1, LOWER), (1, UPPER)])
+@pytest.mark.parametrize("start", [-0.01, 0.01])
+def test_steps_that_rounding_would_excuse_do_not_add_up(side, limit, start):
+    """Outside as well, where each may get no further than the best one so far."""
+    rounding = 2.0 * (STEP.position + STEP.velocity**2 / BRAKING) + 1e-6
+    joint = guard(track(limit + side * start))
+    passed = 0
+    for count in range(1, 1000):
+        asked = track(limit + side * (start + count * STEP.position))
+        if ask(joint, asked, STEP) is not None:
+            break
+        joint.keep(asked)
+        passed = count
+    assert start + passed * STEP.position == pytest.approx(max(start, 0.0) + rounding, abs=STEP.position)
+
+
+@pytest.mark.parametrize("between", [Asked.of(0.0, 0.0, 0.0, 0.0, 0.0), None])
+def test_after_a_pause_a_joint_outside_is_led_from_where_it_is(between):
+    joint = guard(track(UPPER - 0.1))
+    if between is None:
+        joint.forget()
+    else:
+        joint.keep(between)
+    outside = track(UPPER + 0.03)
+    assert ask(joint, outside, position=UPPER + 0.03) is None
+    joint.keep(outside)
+    assert ask(joint, outside) is None
+
+
+@pytest.mark.parametrize(("side", "limit"), [(-1, LOWER), (1, UPPER)])
 def test_outside_a_limit_only_the_way_back_is_allowed(side, limit):
     outside = track(limit + side * 0.05)
     assert ask(guard(outside), track(limit + side * 0.049, -side * 0.01)) is None

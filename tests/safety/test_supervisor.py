@@ -521,6 +521,14 @@ def test_arming_outside_a_limit_begins_the_recovery(beyond, tool_out, recovers):
     assert bench.supervisor.recovery is recovers
 
 
+def test_an_arm_is_not_stopped_for_what_did_not_leave_before_it_was_armed():
+    bench = Bench(State.READY)
+    for _ in range(5):
+        bench.supervisor.bus.sent(delivered=False)
+    bench.supervisor.handle(Event.ARM)
+    assert bench.observe() is State.ARMED
+
+
 def test_a_refused_event_changes_nothing():
     supervisor = Bench(State.READY).supervisor
     before = supervisor.epoch

@@ -2,10 +2,12 @@
 
 from robotctl.hal.robot import Robot
 from robotctl.trials.scenario import Scenario
-from robotctl.trials.scenarios import limits, measured
+from robotctl.trials.scenarios import bus, configuration, guarded, limits, machine, measured, operator, policy
+
+_MODULES = (limits, guarded, measured, policy, machine, bus, operator, configuration)
 
 
 def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     """Return the scenarios of a robot on a backend, in the order of the protections."""
-    found = [scenario for module in (limits, measured) for scenario in module.scenarios(robot, backend)]
+    found = [scenario for module in _MODULES for scenario in module.scenarios(robot, backend)]
     return sorted(found, key=lambda scenario: scenario.number)

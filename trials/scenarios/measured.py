@@ -1,5 +1,8 @@
 """P3, P5, P12, P17, P24: faults that show in what is measured."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
 from robotctl.hal.robot import Robot
@@ -8,11 +11,14 @@ from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
 from robotctl.trials.faults import (
     Planted,
+    driven,
     everywhere,
     failed,
     fastest,
+    hot,
     misread,
     mute,
+    pulled,
     runaway,
     stuck,
     teleported,
@@ -27,6 +33,7 @@ from robotctl.trials.stops import Expected, stop_scenario
 
 _BEYOND = 0.005
 """rad or m past where a breach begins."""
+_PULL_S = 0.2
 _SPRING_S = 3.0
 """Moved by hand, the arm springs back to where its drives hold it, and swings."""
 _CRASH_REST_S = 1.5
@@ -40,8 +47,7 @@ def _still(bench: Bench) -> None:
 
 
 def _at_limit(bench: Bench) -> None:
-    bench.plant.place(at_limit(bench.robot, np.random.default_rng(bench.seed), _BEYOND)[0])
-    bench.tick()
+    bench.place(at_limit(bench.robot, np.random.default_rng(bench.seed), _BEYOND)[0])
     _still(bench)
 
 
@@ -59,21 +65,50 @@ def _slipped(bench: Bench) -> Planted:
 
 def _sphere_poses(bench: Bench) -> tuple[np.ndarray, np.ndarray]:
     breach = bench.robot.profile.safety.sphere_breach
-    return at_sphere(bench.robot, np.random.default_rng(bench.seed), (-_BEYOND, breach + _BEYOND))
+    return at_sphere(bench.robot, np.random.default_rng(bench.seed), (-_BEYOND, breach + 0.2 * _BEYOND))
 
 
 def _at_sphere(bench: Bench) -> None:
-    bench.plant.place(_sphere_poses(bench)[0])
-    bench.tick()
+    bench.place(_sphere_poses(bench)[0])
     _still(bench)
 
 
 def _outside_sphere(bench: Bench) -> Planted:
-    return teleported(bench, _sphere_poses(bench)[1])
+    return pulled(bench, _sphere_poses(bench)[1], _PULL_S)
+
+
+def _kicked(times: float) -> Callable[[Bench], Planted]:
+    """Return the fault of something that drives the most sluggish joint at a multiple of its cap."""
+
+    def plant(bench: Bench) -> Planted:
+        gains = [joint.gains.kd for joint in bench.robot.profile.joints]
+        axis = int(np.argmax([bench.plant.inertia(axis) / kd for axis, kd in enumerate(gains)]))
+        return driven(bench, axis, times * float(bench.robot.limits.velocity[axis]))
+
+    return plant
 
 
 def _some(bench: Bench) -> int:
     return int(bench.random.integers(bench.robot.dof))
+
+
+def _wrong_way(bench: Bench) -> Planted:
+    return weak(bench, fastest(bench), -1.0)
+
+
+def _half(bench: Bench) -> Planted:
+    """The joint that has most to carry for its stiffness."""
+    stiffness = np.array([joint.gains.kp for joint in bench.robot.profile.joints])
+    return weak(bench, int((np.abs(bench.plant.truth().effort) / stiffness).argmax()), 0.5)
+
+
+def _runaway(bench: Bench) -> Planted:
+    axis = fastest(bench)
+    return runaway(bench, axis, 0.3 * float(bench.robot.limits.torque[axis]))
+
+
+def _failed(bench: Bench) -> Planted:
+    return failed(bench, _some(bench))
 
 
 def _one_mute(bench: Bench) -> Planted:
@@ -107,12 +142,22 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         clears=Clears.RETREAT,
         excused=frozenset({"position", "velocity"}),
     )
+    # An angle that jumps is not believed at once.
+    slipped = replace(position, within_s=2.0 * robot.period_ns * 1e-9)
     outside = Expected(
         protection=Protection.SPHERE,
         category=Category.BRAKE_HOLD,
         clears=Clears.RETREAT,
+        within_s=_PULL_S,
         rest_s=_SPRING_S,
         excused=frozenset({"sphere", "velocity"}),
+    )
+    dead = Expected(
+        protection=Protection.FEEDBACK,
+        category=Category.BRAKE_OFF,
+        within_s=safety.feedback_fault_s,
+        rest_s=_CRASH_REST_S,
+        excused=frozenset({"velocity"}),
     )
     silent = Expected(protection=Protection.FEEDBACK, category=Category.BRAKE_OFF, within_s=safety.feedback_fault_s)
     led_away = Expected(
@@ -122,32 +167,43 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         rest_s=_CRASH_REST_S,
         excused=frozenset({"velocity"}),
     )
+    astray = replace(
+        led_away, or_else=((Protection.OVERSPEED, Category.BRAKE_OFF), (Protection.OVERSPEED, Category.CUT))
+    )
+    overspeed = replace(
+        led_away,
+        protection=Protection.OVERSPEED,
+        within_s=3.0 * robot.period_ns * 1e-9,
+        excused=frozenset({"velocity", "position", "sphere"}),
+    )
+    failure = Expected(
+        protection=Protection.DRIVE,
+        category=Category.BRAKE_OFF,
+        clears=Clears.POWER,
+        rest_s=_CRASH_REST_S,
+        excused=frozenset({"velocity"}),
+    )
     return [
         stop_scenario(3, "past a limit", "a joint is moved past its soft limit", _past_limit, position, _at_limit),
-        stop_scenario(3, "slipped encoder", "a joint is measured past its limit", _slipped, position, _at_limit),
+        stop_scenario(3, "slipped encoder", "a joint is measured past its limit", _slipped, slipped, _at_limit),
         stop_scenario(5, "outside", "the arm is moved until its tool is outside", _outside_sphere, outside, _at_sphere),
         stop_scenario(12, "one mute", "a drive obeys, but is not heard of", _one_mute, silent),
         stop_scenario(12, "all mute", "no drive is heard of", _all_mute, silent),
         stop_scenario(12, "taking turns", "one drive at a time is heard of", _taking_turns, silent),
-        stop_scenario(12, "power lost", "a drive loses its supply", lambda b: unpowered(b, [_some(b)]), silent),
+        stop_scenario(12, "power lost", "a drive loses its supply", lambda b: unpowered(b, [_some(b)]), dead),
         resuming_scenario(12, "short gap", "no drive is heard of for 30 ms", _all_mute, 0.03),
         stop_scenario(17, "stuck joint", "the fastest joint seizes up", stuck, led_away),
+        stop_scenario(17, "wrong direction", "a drive pushes the wrong way", _wrong_way, astray),
+        stop_scenario(17, "half the torque", "a drive applies half its torque", _half, astray),
+        stop_scenario(17, "runaway", "a drive turns with 30 % of its torque by itself", _runaway, astray),
+        stop_scenario(18, "overspeed", "a joint is driven at 1.4 times its cap", _kicked(1.4), overspeed),
         stop_scenario(
-            17, "wrong direction", "a drive pushes the wrong way", lambda b: weak(b, fastest(b), -1.0), led_away
+            18,
+            "far overspeed",
+            "a joint is driven at twice its cap",
+            _kicked(2.0),
+            replace(overspeed, category=Category.CUT),
         ),
-        stop_scenario(17, "half the torque", "a drive applies half its torque", lambda b: weak(b, 1, 0.5), led_away),
-        stop_scenario(
-            17,
-            "runaway",
-            "a drive turns with 30 % of its torque by itself",
-            lambda b: runaway(b, fastest(b), 0.3 * b.robot.limits.torque[fastest(b)]),
-            led_away,
-        ),
-        stop_scenario(
-            24,
-            "drive fault",
-            "a drive reports over-current and goes off",
-            lambda b: failed(b, _some(b)),
-            Expected(protection=Protection.DRIVE, category=Category.BRAKE_OFF, clears=Clears.POWER),
-        ),
+        stop_scenario(24, "drive fault", "a drive reports over-current and goes off", _failed, failure),
+        stop_scenario(24, "too hot", "a drive is at 95 degrees", lambda b: hot(b, _some(b), 95.0), failure),
     ]

@@ -1,0 +1,189 @@
+"""P13, P14, P15: what may go wrong between the host and its drives."""
+
+import errno
+from collections.abc import Callable
+from dataclasses import replace
+
+import can
+import numpy as np
+
+from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S, Register
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Fault, Sample
+from robotctl.safety.trip import Category, Protection
+from robotctl.sim.motors import trouble as wire
+from robotctl.sim.trouble import Lose, Misread, NoWatchdog, Reject, Report, Trouble
+from robotctl.trials.bench import Bench
+from robotctl.trials.clearing import Clears
+from robotctl.trials.faults import Planted, between, misread, on_wire
+from robotctl.trials.orphans import orphan_scenario, without_bus
+from robotctl.trials.refusals import refusal_scenario
+from robotctl.trials.scenario import Scenario
+from robotctl.trials.shaping import tolerated_scenario
+from robotctl.trials.stops import Expected, stop_scenario
+
+_UNDELIVERED_TICKS = 5
+_FULL_NS = 40_000_000
+_ERROR_BUS_OFF = 0x40
+_ERROR_RESTARTED = 0x100
+
+
+def _timeout_of(seconds: float) -> Callable[[Robot, str, int], None]:
+    """Return the attempt to bring up an arm one of whose drives has this watchdog; 0 is none."""
+
+    def attempt(robot: Robot, backend: str, seed: int) -> None:
+        bench = Bench(robot, backend, seed)
+        axis = int(bench.random.integers(robot.dof))
+        name = robot.profile.joints[axis].name
+        if bench.twin:
+            bench.arm.troubles.append(NoWatchdog(name))
+        else:
+            bench.arm.connect()
+            bench.motors.drive(name).preset(Register.TIMEOUT, round(seconds / TIMEOUT_UNIT_S))
+        with bench:
+            pass
+
+    return attempt
+
+
+def _bus_off(bench: Bench) -> Planted:
+    if bench.bus is None:
+        return between(bench, Report(Fault("bus", _ERROR_BUS_OFF, "BUS_OFF", "check cable and termination")))
+    bus = bench.bus
+    bus.report(_ERROR_BUS_OFF)
+    return Planted(
+        lambda: bus.report(_ERROR_RESTARTED), lambda: (bench.arm.bus_statistics() or {})["state"] == "bus-off"
+    )
+
+
+def _queue_full(bench: Bench) -> Planted:
+    """Nothing leaves the host for a while, and the loop is told so; the drives' watchdogs have not bitten yet."""
+    ends = bench.now_ns + _FULL_NS
+    if bench.bus is None:
+        lost = Lose()
+        planted = between(bench, lost)
+    else:
+        _fail(bench, errno.ENOBUFS)
+        planted = between(bench, Trouble())
+
+    class Ending(Trouble):
+        def on_read(self, sample: Sample) -> Sample:
+            if bench.now_ns >= ends and not self.acted:
+                self.acted += 1
+                planted.undo()
+                if bench.bus is not None:
+                    bench.bus.failure = None
+            return sample
+
+    return between(bench, Ending())
+
+
+def _fail(bench: Bench, number: int) -> None:
+    assert bench.bus is not None
+    bench.bus.failure = can.CanOperationError("a test", number)
+
+
+def _unplugged(bench: Bench) -> None:
+    _fail(bench, errno.ENODEV)
+
+
+def _blocked(bench: Bench) -> None:
+    _fail(bench, errno.ENOBUFS)
+
+
+def _no_sense(bench: Bench) -> Planted:
+    """A drive's answers lose their last bytes."""
+    if bench.twin:
+        return between(bench, Reject())
+    rejected = _rejected(bench)
+    return on_wire(bench, wire.Short(), [_some(bench)], lambda: _rejected(bench) > rejected)
+
+
+def _flipped(bench: Bench) -> Planted:
+    """Every second answer of a drive has a bit flipped on its way."""
+    begun = bench.now_ns
+
+    def showed() -> bool:
+        return len(bench.since(begun)) > 0
+
+    return on_wire(bench, wire.Corrupt(probability=0.5), [_some(bench)], showed)
+
+
+def _jumped(bench: Bench) -> Planted:
+    return misread(bench, _some(bench), 0.5)
+
+
+def _no_number(bench: Bench) -> Planted:
+    wrong = np.zeros(bench.robot.dof)
+    wrong[_some(bench)] = np.nan
+    return between(bench, Misread(wrong))
+
+
+def _on_all(trouble: wire.Trouble) -> Callable[[Bench], Planted]:
+    def plant(bench: Bench) -> Planted:
+        received = int(str((bench.arm.bus_statistics() or {})["received"]))
+        return on_wire(
+            bench,
+            trouble,
+            range(bench.robot.dof),
+            lambda: int(str((bench.arm.bus_statistics() or {})["received"])) > received,
+        )
+
+    return plant
+
+
+def _some(bench: Bench) -> int:
+    return int(bench.random.integers(bench.robot.dof))
+
+
+def _rejected(bench: Bench) -> int:
+    return int(str((bench.arm.bus_statistics() or {})["rejected"]))
+
+
+def scenarios(robot: Robot, backend: str) -> list[Scenario]:
+    period = robot.period_ns * 1e-9
+    safety = robot.profile.safety
+    on_bus = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF, within_s=_UNDELIVERED_TICKS * period)
+    # For as long as nothing leaves, the drives go on as they were told last.
+    coasting = replace(on_bus, excused=frozenset({"sphere", "position"}))
+    # Drives that hear nothing any more go off by their own watchdogs, with a fault.
+    unheard = replace(on_bus, clears=Clears.POWER)
+    senseless = Expected(
+        protection=Protection.RECEIVE, category=Category.BRAKE_OFF, within_s=safety.rejected_frames * period
+    )
+    found = [
+        refusal_scenario(13, "no watchdog", "a drive has no watchdog", _timeout_of(0.0), ["watchdog"], 3),
+        orphan_scenario(13, "loop gone", "the loop is not heard of any more"),
+        stop_scenario(
+            14, "bus-off", "the controller leaves the bus", _bus_off, on_bus if backend == "sim" else unheard
+        ),
+        stop_scenario(14, "queue full", "nothing leaves the host for 40 ms", _queue_full, coasting),
+        stop_scenario(15, "senseless", "answers of a wrong length", _no_sense, senseless),
+        stop_scenario(15, "jump", "an encoder jumps by 0.5 rad", _jumped, senseless),
+    ]
+    if backend == "sim":
+        return [*found, stop_scenario(15, "no number", "an angle is no number", _no_number, senseless)]
+    too_long = 2.0 * safety.drive_timeout_s
+    sooner_or_later = Expected(
+        protection=Protection.RECEIVE,
+        category=Category.BRAKE_OFF,
+        within_s=0.5,
+        or_else=((Protection.DRIVE, Category.BRAKE_OFF), (Protection.FEEDBACK, Category.BRAKE_OFF)),
+    )
+    return [
+        *found,
+        refusal_scenario(
+            13, "long watchdog", "a watchdog twice as long as allowed", _timeout_of(too_long), ["watchdog"]
+        ),
+        orphan_scenario(14, "nobody listens", "nothing leaves the host any more", _blocked, without_bus),
+        orphan_scenario(14, "unplugged", "the adapter is unplugged", _unplugged, without_bus),
+        stop_scenario(15, "flipped bits", "half the answers of a drive have a bit flipped", _flipped, sooner_or_later),
+        tolerated_scenario(15, "twice", "every answer comes twice", _on_all(wire.Duplicate())),
+        tolerated_scenario(
+            15,
+            "late and out of order",
+            "answers come 1 to 4 ms late",
+            _on_all(wire.Delay(delay_s=0.001, jitter_s=0.003)),
+        ),
+        tolerated_scenario(15, "lost", "2 % of all frames are lost", _on_all(wire.Drop(probability=0.02))),
+    ]
