@@ -1,10 +1,11 @@
 """Reset routines: small motions the supervisor runs by itself, through the same limiter and shaper as a policy.
 
-| | routine   | what it does                                                            |
-|-|-----------|-------------------------------------------------------------------------|
-|R0| `Settle`  | waits for measured standstill                                           |
-|R1| `Retreat` | leads joints, tool and links back inside, at a tenth of the caps        |
-|R2| `Goto`    | leads the joints straight to a pose (home, rest)                        |
+| | routine       | what it does                                                        |
+|-|---------------|---------------------------------------------------------------------|
+|R0| `Settle`      | waits for measured standstill                                       |
+|R1| `Retreat`     | leads joints, tool and links back inside, at a tenth of the caps    |
+|R2| `Goto`        | leads the joints straight to a pose (home, rest)                    |
+|R4| `RandomStart` | the same, to a pose drawn around home                               |
 """
 
 from abc import ABC, abstractmethod
@@ -12,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
 from robotctl.safety.proximity import NothingNear, Scene
@@ -26,6 +28,9 @@ _RETREAT_DEPTH = 0.01
 """How far inside a boundary a retreat ends, m and rad."""
 _RETREAT_CLEARANCE = 2e-3
 """Beyond what the shaper keeps, m. No more, since some links are never far from each other."""
+_START_ROOM = 0.02
+"""How far inside every region the tool is at a random start, m."""
+_DRAWS = 100
 
 
 class Geometry(Protocol):
@@ -117,3 +122,31 @@ class Goto(Routine):
         _, jacobian = self._geometry.tool_and_jacobian(position)
         speed = float(np.linalg.norm(jacobian @ wanted)) / self._tool_speed
         return wanted / max(1.0, speed, float((np.abs(wanted) / self._cap).max()))
+
+
+class RandomStart(Goto):
+    """R4: to a pose drawn evenly from the box of `start_spread` around home; the same for the same seed."""
+
+    def __init__(self, robot: Robot, seed: int, geometry: Geometry) -> None:
+        """Draw the pose: what is outside a soft limit, or leaves a region less than 2 cm, is drawn anew.
+
+        Raises:
+            ConfigError: if the seed is negative, or the box holds hardly a pose that may be.
+        """
+        super().__init__(robot, _draw(robot, seed, geometry), f"random start {seed}", geometry)
+
+
+def _draw(robot: Robot, seed: int, geometry: Geometry) -> Vector:
+    if seed < 0:
+        raise ConfigError(f"seed {seed} is negative", "use one from 0 on")
+    profile, limits = robot.profile, robot.limits
+    rng = np.random.default_rng(seed)
+    margin = profile.safety.position_margin
+    allowed = regions(profile, profile.safety.sphere_margin + _START_ROOM)
+    for _ in range(_DRAWS):
+        pose = profile.home + rng.uniform(-profile.start_spread, profile.start_spread, robot.dof)
+        inside = ((pose >= limits.lower + margin) & (pose <= limits.upper - margin)).all()
+        tool, _ = geometry.tool_and_jacobian(pose)
+        if inside and all(region.room(tool) >= 0.0 for region in allowed):
+            return np.asarray(pose)
+    raise ConfigError(f"no random start found in {_DRAWS} draws", "make start_spread smaller, or move home inwards")
