@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -70,6 +71,7 @@ def run(
         else:
             session = ProcessSession(model, backend, channel, overrides)
             actor = ProcessActor(session, work, policy, seed, overrides)
+        session.on_page = partial(_page, console)
         name = model.profile.name
         about = {"backend": backend, "robot": name, "task": work.name, "policy": policy, "seed": seed}
         path = record or Path("recordings") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}-{backend}.mcap"
@@ -151,6 +153,11 @@ def _attempt(job: Job, outcome: Outcome, console: Console) -> Exit:
         console.print(f"  {outcome.stopped}")
         session.bring_to_rest(Verb.ESTOP)
     return Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
+
+
+def _page(console: Console, why: str) -> None:
+    console.bell()
+    console.print(f"  operator, please: {why}", style="bold", markup=False)
 
 
 def _wind_down(session: Session) -> None:

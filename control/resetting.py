@@ -23,7 +23,7 @@ class Resetting:
         self._begin(now_ns)
 
     def velocity(self, sample: Sample, position: Vector, now_ns: int) -> Vector | Trip | None:
-        """Return the wanted joint velocity (n,), rad/s, at reference `position`; None when done, a trip when given up."""
+        """Return the wanted joint velocity (n,), rad/s, at reference `position`; None when done, a trip to give up."""
         if now_ns < self._begins_ns:
             return self._rest
         routine = self._left[0]

@@ -105,10 +105,11 @@ class Retreat(Routine):
 class Goto(Routine):
     """R2: a straight line in joint space, all joints arriving together."""
 
+    timeout_s = 60.0
+
     def __init__(self, robot: Robot, pose: Vector, name: str, geometry: Geometry) -> None:
         safety = robot.profile.safety
         self.name = name
-        self.timeout_s = 60.0
         self._pose = pose
         self._cap = safety.reset_scale * robot.limits.velocity
         self._tool_speed = safety.reset_tool_speed

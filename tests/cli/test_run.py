@@ -9,6 +9,7 @@ from typer.testing import CliRunner, Result
 
 from robotctl.cli.main import app
 from robotctl.hal.robot import profile_path
+from robotctl.safety.routines import Goto
 
 
 def robotctl(folder: Path, *arguments: str) -> tuple[Result, dict[str, Any]]:
@@ -146,3 +147,13 @@ def test_a_report_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 2
     assert "cannot write /nowhere/r.json" in result.output
+
+
+def test_a_reset_that_fails_calls_for_the_operator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Goto, "timeout_s", 1.0)
+    settings = ["--set", "twin.start=[0.9, -0.4, 0.0, -2.2, 0.0, 1.9, 0.785]", "--set", "safety.reset_scale=0.01"]
+    result, report = robotctl(tmp_path, *settings)
+    assert result.exit_code == 3, result.output
+    assert "operator, please: P29: reset routine 'home' did not arrive in 3 tries of 1 s" in result.output
+    assert [page.split(":")[0] for page in report["safety"]["pages"]] == ["P29"]
+    assert report["episodes"] == []

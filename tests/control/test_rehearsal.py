@@ -81,7 +81,9 @@ def test_a_retreat_is_rehearsed_from_outside(panda: Robot) -> None:
 
 
 @pytest.fixture
-def session(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ProcessSession]:
+def session(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[ProcessSession]:
     """An armed twin in a process of its own, with the first joint turned away from home."""
     turn, *settings = request.param
     monkeypatch.setenv("ROBOTCTL_RUNTIME_DIR", str(tmp_path))
