@@ -309,7 +309,7 @@ class Loop:
             case Verb.SETTLE:
                 self._reset([Settle(self.robot)], now)
             case Verb.RANDOM_START:
-                self._reset([RandomStart(self.robot, self._link.desk.argument, self.kinematics)], now)
+                self._reset([self._random_start()], now)
             case Verb.STOP:
                 supervisor.handle(Event.STOP)
             case Verb.DISARM:
@@ -327,6 +327,9 @@ class Loop:
                 self._serve_estop("the operator", now)
             case Verb.CLOSE:
                 self._close(now)
+
+    def _random_start(self) -> RandomStart:
+        return RandomStart(self.robot, self._link.desk.argument, self.kinematics, self._motion.scene)
 
     def _goto(self, pose: Sequence[float], name: str) -> Goto:
         return Goto(self.robot, np.array(pose), name, self.kinematics)

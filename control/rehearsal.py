@@ -15,7 +15,7 @@ from robotctl.safety.shaper import Clip
 _BACKEND = "sim"
 _STALL_S = 5.0
 """Simulated time in which a routine has to get on; one that does not would only be tried again."""
-_STALL = 1e-3
+_STALL = 1e-2
 """rad"""
 
 

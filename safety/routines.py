@@ -26,7 +26,7 @@ _ARRIVED = 2e-3
 _RETREAT_SCALE = 0.1
 _RETREAT_DEPTH = 0.01
 """How far inside a boundary a retreat ends, m and rad."""
-_RETREAT_CLEARANCE = 2e-3
+_CLEARANCE = 2e-3
 """Beyond what the shaper keeps, m. No more, since some links are never far from each other."""
 _START_ROOM = 0.02
 """How far inside every region the tool is at a random start, m."""
@@ -79,7 +79,7 @@ class Retreat(Routine):
         self._geometry = geometry
         self._regions = regions(robot.profile, safety.sphere_margin)
         self._scene = scene or NothingNear(robot.dof)
-        self._clear = safety.proximity_stop + safety.proximity_margin + _RETREAT_CLEARANCE
+        self._clear = safety.proximity_stop + safety.proximity_margin + _CLEARANCE
 
     def velocity(self, sample: Sample, position: Vector) -> Vector | None:
         inside = np.minimum(np.maximum(position, self._lower), self._upper)
@@ -128,26 +128,28 @@ class Goto(Routine):
 class RandomStart(Goto):
     """R4: to a pose drawn evenly from the box of `start_spread` around home; the same for the same seed."""
 
-    def __init__(self, robot: Robot, seed: int, geometry: Geometry) -> None:
-        """Draw the pose: what is outside a soft limit, or leaves a region less than 2 cm, is drawn anew.
+    def __init__(self, robot: Robot, seed: int, geometry: Geometry, scene: Scene | None = None) -> None:
+        """Draw the pose, again if a joint, the tool or a link would be where a policy should not begin.
 
         Raises:
             ConfigError: if the seed is negative, or the box holds hardly a pose that may be.
         """
-        super().__init__(robot, _draw(robot, seed, geometry), f"random start {seed}", geometry)
+        if seed < 0:
+            raise ConfigError(f"seed {seed} is negative", "use one from 0 on")
+        pose = _draw(robot, np.random.default_rng(seed), geometry, scene or NothingNear(robot.dof))
+        super().__init__(robot, pose, f"random start {seed}", geometry)
 
 
-def _draw(robot: Robot, seed: int, geometry: Geometry) -> Vector:
-    if seed < 0:
-        raise ConfigError(f"seed {seed} is negative", "use one from 0 on")
-    profile, limits = robot.profile, robot.limits
-    rng = np.random.default_rng(seed)
-    margin = profile.safety.position_margin
-    allowed = regions(profile, profile.safety.sphere_margin + _START_ROOM)
+def _draw(robot: Robot, rng: np.random.Generator, geometry: Geometry, scene: Scene) -> Vector:
+    profile, limits, safety = robot.profile, robot.limits, robot.profile.safety
+    allowed = regions(profile, safety.sphere_margin + _START_ROOM)
+    clear = safety.proximity_stop + safety.proximity_margin + _CLEARANCE
     for _ in range(_DRAWS):
         pose = profile.home + rng.uniform(-profile.start_spread, profile.start_spread, robot.dof)
-        inside = ((pose >= limits.lower + margin) & (pose <= limits.upper - margin)).all()
+        room = np.minimum(pose - limits.lower, limits.upper - pose).min() - safety.position_margin
         tool, _ = geometry.tool_and_jacobian(pose)
-        if inside and all(region.room(tool) >= 0.0 for region in allowed):
+        if min(room, *(region.room(tool) for region in allowed)) < 0.0:
+            continue
+        if (scene.measure(pose, range(len(scene.pairs))) >= clear).all():
             return np.asarray(pose)
     raise ConfigError(f"no random start found in {_DRAWS} draws", "make start_spread smaller, or move home inwards")

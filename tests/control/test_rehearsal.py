@@ -13,7 +13,7 @@ from robotctl.control.session import LockstepSession, Stopped
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.machine import State
 
-POST = "keep_out=[{kind: box, name: post, centre: [0.5, 0.2, 0.45], half: [0.3, 0.02, 0.45]}]"
+POST = "keep_out=[{kind: box, name: post, centre: [0.45, 0.22, 0.2], half: [0.1, 0.02, 0.25]}]"
 """A post between home and where the first joint has turned to the left."""
 
 
@@ -46,7 +46,7 @@ def test_it_takes_as_long_as_the_arm_itself(panda: Robot) -> None:
 def test_a_way_that_is_barred_is_found_out() -> None:
     robot = load_robot("panda", [POST])
     found = rehearse(robot, beside(robot, 0.9), Verb.HOME)
-    assert found.objection == "it got no further, held back by KEEP_OUT"
+    assert found.objection == "it got no further, held back by PROXIMITY"
     assert sum(found.violations.values()) == 0
     assert found.duration_s < 60.0
 
@@ -100,7 +100,7 @@ def test_nothing_moves_where_the_rehearsal_fails(session: ProcessSession) -> Non
     pages: list[str] = []
     session.on_page = pages.append
     before = session.latest()["true_position"]
-    with pytest.raises(Stopped, match=r"HOME was rehearsed in the twin and is refused: it got no further.*KEEP_OUT"):
+    with pytest.raises(Stopped, match=r"HOME was rehearsed in the twin and is refused: it got no further.*PROXIMITY"):
         session.reset()
     session.advance(0.1)
     assert session.state is State.ARMED

@@ -12,7 +12,7 @@ from robotctl.safety.routines import Goto
 
 HOME = [0.0, -0.4, 0.0, -2.2, 0.0, 1.9, 0.785]
 VIA = [[0.3, *HOME[1:]], [0.3, -0.2, *HOME[2:]]]
-POST = "keep_out=[{kind: box, name: post, centre: [0.5, 0.2, 0.45], half: [0.3, 0.02, 0.45]}]"
+POST = "keep_out=[{kind: box, name: post, centre: [0.45, 0.22, 0.2], half: [0.1, 0.02, 0.25]}]"
 """Between home and where the first joint has turned to the left."""
 BESIDE = f"twin.start={[0.9, *HOME[1:]]}"
 

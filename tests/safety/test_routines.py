@@ -243,3 +243,23 @@ def test_a_random_start_is_led_to(panda: Robot):
     routine = RandomStart(panda, 5, kinematics)
     positions, _, _ = lead(panda, kinematics, routine, panda.profile.home)
     assert positions[-1] == pytest.approx(drawn(panda, 5, kinematics), abs=2e-3)
+
+
+class Wall:
+    """One pair, with clearance where the first joint is turned to the left."""
+
+    pairs = (("link", "wall"),)
+
+    def __init__(self, robot: Robot):
+        self.home = robot.profile.home[0]
+        self.reach = np.zeros((1, robot.dof))
+
+    def measure(self, position, pairs):
+        return np.array([position[0] - self.home])[list(pairs)]
+
+
+def test_random_starts_keep_links_apart(panda: Robot):
+    kinematics, safety = Kinematics(panda), panda.profile.safety
+    clear = safety.proximity_stop + safety.proximity_margin + 2e-3
+    away = [RandomStart(panda, seed, kinematics, Wall(panda))._pose[0] - panda.profile.home[0] for seed in range(200)]
+    assert clear <= min(away) < clear + 5e-3
