@@ -79,6 +79,7 @@ class ProcessSession(Session):
             board_fd=board,
             slots=self.link.ticks.slots,
             operator=os.getpid(),
+            limits=self.robot.limits_text,
         )
         shared = [mailbox, board]
         if is_shared(self._channel):
