@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -15,10 +16,12 @@ from rich.console import Console
 from robotctl.cli.errors import Exit, hear_interrupts, readable_errors
 from robotctl.cli.keys import stop_keys
 from robotctl.cli.output import write_json
+from robotctl.control.acknowledgement import acknowledge, require_acknowledged
 from robotctl.control.loop import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.recording_session import SessionRecording, record_session
 from robotctl.control.session import LockstepSession, Session
+from robotctl.hal.can.channel import may_be_real
 from robotctl.hal.errors import ConfigError, HardwareError
 from robotctl.hal.profile import CLASSIC_HZ
 from robotctl.hal.robot import load_robot
@@ -44,6 +47,9 @@ def run(
         bool, typer.Option("--fast", help="Simulation in lockstep, as fast as the machine allows.")
     ] = False,
     record: Annotated[Path | None, typer.Option(help="MCAP file to write; default recordings/TIME-ROBOT.mcap.")] = None,
+    accept_limits: Annotated[
+        bool, typer.Option("--accept-limits", help="Real drives: the limits are those that the arm should be held to.")
+    ] = False,
     json: Annotated[Path | None, typer.Option(help="Write the report here.")] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Override a profile key, e.g. twin.lag_s=0.02.")
@@ -70,13 +76,16 @@ def run(
         else:
             session = ProcessSession(model, backend, channel, overrides)
             actor = ProcessActor(session, work, policy, seed, overrides)
+        session.on_page = partial(_page, console)
         name = model.profile.name
         about = {"backend": backend, "robot": name, "task": work.name, "policy": policy, "seed": seed}
+        about["limits_hash"] = model.limits_hash
         path = record or Path("recordings") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}-{backend}.mcap"
         console.print(
             f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}"
         )
-        job = Job(session, actor, work, episodes, seed, path, about, overrides)
+        real = may_be_real(channel)
+        job = Job(session, actor, work, episodes, seed, path, about, overrides, real, accept_limits)
         try:
             status, result, lost = _carry_out(job, console)
         except Terminated:  # before anything moved, or after everything had come to rest
@@ -102,6 +111,9 @@ class Job:
     path: Path
     about: dict[str, Any]
     overrides: list[str]
+    real: bool
+    """Whether the drives may be real ones."""
+    accept_limits: bool
 
 
 def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any], HardwareError | None]:
@@ -115,11 +127,13 @@ def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any], Hardwa
     lost: HardwareError | None = None
     recorded = record_session(session, job.path, job.about, on_trip, job.overrides)
     try:
-        with _terminable(), session, recorded as recording, job.actor as actor:
-            recording.processes["policy"] = actor.pid
-            with _stopped_by_errors(session), stop_keys(session.emergency_stop):
-                status = _attempt(job, outcome, console)
-            state = session.state.name
+        with _terminable(), session:
+            _look_at_limits(job)
+            with recorded as recording, job.actor as actor:
+                recording.processes["policy"] = actor.pid
+                with _stopped_by_errors(session), stop_keys(session.emergency_stop):
+                    status = _attempt(job, outcome, console)
+                state = session.state.name
     except HardwareError as error:
         status, lost, state = Exit.NO_HARDWARE, error, session.state.name
     result = report(session, outcome, job.about, recording)
@@ -127,6 +141,14 @@ def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any], Hardwa
     result["processes"] = recording.processes
     result["error"] = lost.what if lost is not None else ""
     return status, result, lost
+
+
+def _look_at_limits(job: Job) -> None:
+    """Let nothing but bring-up happen to real drives before a person has acknowledged the limits of their arm (P25)."""
+    if job.real:
+        if job.accept_limits:
+            acknowledge(job.session.robot)
+        require_acknowledged(job.session.robot)
 
 
 def _attempt(job: Job, outcome: Outcome, console: Console) -> Exit:
@@ -151,6 +173,11 @@ def _attempt(job: Job, outcome: Outcome, console: Console) -> Exit:
         console.print(f"  {outcome.stopped}")
         session.bring_to_rest(Verb.ESTOP)
     return Exit.STOPPED_BY_SAFETY if outcome.stopped else Exit.DONE
+
+
+def _page(console: Console, why: str) -> None:
+    console.bell()
+    console.print(f"  operator, please: {why}", style="bold", markup=False)
 
 
 def _wind_down(session: Session) -> None:

@@ -6,6 +6,7 @@ It runs in real time in a process of its own (`control.process`) or in lockstep 
 (`control.session`), unchanged.
 """
 
+from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
@@ -15,6 +16,7 @@ from robotctl.control.lowering import gravity_share
 from robotctl.control.motion import Motion
 from robotctl.control.publisher import Publisher
 from robotctl.control.pulse import Pulse
+from robotctl.control.resetting import Resetting
 from robotctl.control.shared import Link, Power
 from robotctl.hal.backend import Rig
 from robotctl.hal.clock import Clock
@@ -25,7 +27,7 @@ from robotctl.safety.deadman import Grip
 from robotctl.safety.guard import Guard
 from robotctl.safety.machine import ENABLED, Event, Refused, State, after
 from robotctl.safety.overrun import Overrun
-from robotctl.safety.routines import Goto, Retreat, Routine, Settle
+from robotctl.safety.routines import Goto, RandomStart, Retreat, Routine, Settle
 from robotctl.safety.supervisor import Supervisor
 from robotctl.safety.target import FreeDrive, JointTorque, JointVelocity
 from robotctl.safety.trip import Category, Protection, Trip
@@ -54,6 +56,8 @@ class Verb(IntEnum):
     CLOSE = 11
     SELFTEST = 12
     """Again, after one that failed."""
+    RANDOM_START = 13
+    """With a seed as argument."""
 
 
 _VERBS = frozenset(Verb)
@@ -80,8 +84,7 @@ class Loop:
         self._clock = clock
         self._link = link
         self._publisher = Publisher(link, clock, robot.dof)
-        self._routine: Routine | None = None
-        self._routine_ends_ns = 0
+        self._resetting: Resetting | None = None
         self._estop: str = ""
         self._damping = False
         self._lowering_ns: int | None = None
@@ -248,19 +251,18 @@ class Loop:
             self._close(now)
 
     def _routine_velocity(self, sample: Sample, now: int) -> Vector:
-        routine = self._routine
-        if routine is None or self.supervisor.feedback.stale:
+        resetting = self._resetting
+        if resetting is None or self.supervisor.feedback.stale:
             return self._motion.rest
-        velocity = routine.velocity(sample, self._motion.reference.position)
-        if velocity is None:
-            self._routine = None
+        velocity = resetting.velocity(sample, self._motion.reference.position, now)
+        if isinstance(velocity, Trip):
+            self.supervisor.trip(velocity)
+        elif velocity is None:
+            self._resetting = None
             self.supervisor.handle(Event.RESET_DONE)
-            return self._motion.rest
-        if now > self._routine_ends_ns:
-            cause = f"reset routine {routine.name!r} did not arrive within {routine.timeout_s:g} s"
-            self.supervisor.trip(Trip(Protection.RESET, Category.BRAKE_HOLD, cause, self._routine_ends_ns))
-            return self._motion.rest
-        return velocity
+        else:
+            return velocity
+        return self._motion.rest
 
     # -- the operator ---------------------------------------------------------------------------------------------
 
@@ -298,13 +300,16 @@ class Loop:
                 supervisor.handle(Event.START)
                 supervisor.admission.begin(now)
             case Verb.HOME:
-                self._reset(Goto(self.robot, np.array(self.robot.profile.home), "home", self.kinematics), now)
+                way = [*self.robot.profile.home_via, self.robot.profile.home]
+                self._reset([self._goto(pose, "home") for pose in way], now)
             case Verb.PARK:
-                self._reset(Goto(self.robot, np.array(self.robot.profile.rest), "park", self.kinematics), now)
+                self._reset([self._goto(self.robot.profile.rest, "park")], now)
             case Verb.RETREAT:
-                self._reset(Retreat(self.robot, self.kinematics, self._motion.scene), now)
+                self._reset([Retreat(self.robot, self.kinematics, self._motion.scene)], now)
             case Verb.SETTLE:
-                self._reset(Settle(self.robot), now)
+                self._reset([Settle(self.robot)], now)
+            case Verb.RANDOM_START:
+                self._reset([self._random_start()], now)
             case Verb.STOP:
                 supervisor.handle(Event.STOP)
             case Verb.DISARM:
@@ -323,12 +328,17 @@ class Loop:
             case Verb.CLOSE:
                 self._close(now)
 
-    def _reset(self, routine: Routine, now: int) -> None:
-        if self.supervisor.recovery and not isinstance(routine, Retreat):
+    def _random_start(self) -> RandomStart:
+        return RandomStart(self.robot, self._link.desk.argument, self.kinematics, self._motion.scene)
+
+    def _goto(self, pose: Sequence[float], name: str) -> Goto:
+        return Goto(self.robot, np.array(pose), name, self.kinematics)
+
+    def _reset(self, routines: Sequence[Routine], now: int) -> None:
+        if self.supervisor.recovery and not isinstance(routines[0], Retreat):
             raise Refused(self.supervisor.state, Event.RESET)
         self.supervisor.handle(Event.RESET)
-        self._routine = routine
-        self._routine_ends_ns = now + round(routine.timeout_s * 1e9)
+        self._resetting = Resetting(self.robot, routines, now)
 
     def _selftest(self) -> None:
         after(self.supervisor.state, Event.SELFTEST)  # refused before anything is asked of the drives

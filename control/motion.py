@@ -26,7 +26,7 @@ class Motion:
         """Build everything that a motion needs.
 
         Raises:
-            ConfigError: if the profile's home or rest is where tool or links may not be.
+            ConfigError: if the profile leads tool or links to where they may not be.
         """
         self.rest = np.zeros(robot.dof)
         """What is wanted of an arm that is to brake and stay."""
@@ -111,8 +111,8 @@ class Motion:
 
     def _refuse_forbidden_poses(self, robot: Robot) -> None:
         safety, remedy = robot.profile.safety, "change the pose, or what stands in its way"
-        for key in ("home", "rest"):
-            pose = np.array(getattr(robot.profile, key))
+        for key, values in robot.profile.poses.items():
+            pose = np.array(values)
             tool = self._kinematics.tool(pose)
             for region in regions(robot.profile, safety.sphere_margin):
                 room = region.room(tool)

@@ -17,6 +17,7 @@ from robotctl.control.shared import Link, Power
 from robotctl.hal.backend import open_backend
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import ConfigError, RobotctlError
+from robotctl.hal.limits_text import difference
 from robotctl.hal.robot import load_robot
 from robotctl.safety.machine import State
 
@@ -36,6 +37,8 @@ class ProcessConfig:
     slots: int
     operator: int
     """Pid of the operator's process."""
+    limits: str
+    """The limits that the operator's process has seen: `Robot.limits_text`."""
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))
@@ -48,6 +51,9 @@ def main(text: str) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the operator process's business
     try:
         robot = load_robot(config.robot, config.overrides)
+        if robot.limits_text != config.limits:
+            changes = difference(config.limits, robot.limits_text)
+            raise ConfigError(f"{robot.source}: limits changed while it was being started:\n{changes}", "start again")
         link = Link.attach(config.mailbox_fd, config.board_fd, robot.dof, config.slots)
         clock = MonotonicClock()
         loop = Loop(robot, open_backend(config.backend, robot, clock, config.channel), clock, link)

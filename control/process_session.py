@@ -13,7 +13,8 @@ from typing import Any
 from robotctl.control import registry
 from robotctl.control.loop import Verb
 from robotctl.control.process import ProcessConfig
-from robotctl.control.session import Session, history_slots
+from robotctl.control.rehearsal import Rehearsal, rehearse
+from robotctl.control.session import Session, Stopped, history_slots
 from robotctl.control.shared import Link
 from robotctl.control.watchman import LONGEST_RESCUE_S, WatchmanConfig
 from robotctl.hal.can.channel import is_shared
@@ -42,6 +43,8 @@ class ProcessSession(Session):
         self._process: subprocess.Popen[bytes] | None = None
         self._watchman: subprocess.Popen[bytes] | None = None
         self._claim: socket.socket | None = None
+        self.rehearsals: list[Rehearsal] = []
+        """What the reset routines looked like in the twin, in order."""
         self._bus: dict[str, object] | None = None
         self._error: dict[str, Any] | None = None
         self._bereaved = ""
@@ -76,6 +79,7 @@ class ProcessSession(Session):
             board_fd=board,
             slots=self.link.ticks.slots,
             operator=os.getpid(),
+            limits=self.robot.limits_text,
         )
         shared = [mailbox, board]
         if is_shared(self._channel):
@@ -114,6 +118,21 @@ class ProcessSession(Session):
     def bring_to_rest(self, verb: Verb) -> None:
         self._check()  # an arm that its watchman brought down looks like one at rest
         super().bring_to_rest(verb)
+
+    def reset(self, routine: Verb = Verb.HOME, argument: int = 0) -> None:
+        """Run a reset routine to its end, after it went well in the twin (R2): else nothing moves.
+
+        Lockstep sessions have no rehearsal: their arm is the twin. Settling needs none.
+        """
+        if self.state is State.ARMED and routine is not Verb.SETTLE:
+            found = rehearse(self.robot, self.latest()["position"], routine, argument)
+            self.rehearsals.append(found)
+            if found.objection:
+                text = f"{routine.name} was rehearsed in the twin and is refused: {found.objection}"
+                self.page(text)
+                raise Stopped(text, "move the arm by hand, or change the pose or the region that bars its way")
+            self.advance(0.0)  # show life after the silence, before something moves
+        super().reset(routine, argument)
 
     def close(self) -> None:
         process = self._process

@@ -9,6 +9,10 @@ from robotctl.hal.types import Sample, Truth, Vector
 from robotctl.safety.machine import State
 from robotctl.safety.shaper import Clip
 from robotctl.safety.supervisor import Supervisor
+from robotctl.safety.trip import Protection
+
+_AT_HAND = frozenset({Protection.DEADMAN, Protection.ESTOP, Protection.OPERATOR})
+"""Stops by a person, or for want of one: nobody has to be called for them."""
 
 
 class Publisher:
@@ -27,12 +31,18 @@ class Publisher:
         """Write a line for people."""
         self._link.events.write({"type": "log", "stamp_ns": now_ns, "text": text})
 
+    def page(self, text: str, now_ns: int) -> None:
+        """Call for the operator, who may not be looking: a reset ended in a stop."""
+        self._link.events.write({"type": "page", "stamp_ns": now_ns, "text": text})
+
     def report(self, supervisor: Supervisor, now_ns: int) -> None:
         """Write an event for every new trip, and one if the state changed."""
         if supervisor.state is self._state and self._reported == len(supervisor.trips):
             return
         events = self._link.events
         for trip in supervisor.trips[self._reported :]:
+            if self._state is State.RESET and trip.protection not in _AT_HAND:
+                self.page(f"{trip.protection.label}: {trip.cause}", now_ns)
             events.write(
                 {
                     "type": "trip",

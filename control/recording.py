@@ -54,7 +54,7 @@ METADATA = "robotctl"
 """Name of the file's metadata record."""
 _SECOND_NS = 1_000_000_000
 
-_LEVELS = {"trip": LogLevel.Error, "error": LogLevel.Fatal, "dropped": LogLevel.Warning}
+_LEVELS = {"trip": LogLevel.Error, "page": LogLevel.Error, "error": LogLevel.Fatal, "dropped": LogLevel.Warning}
 """How loud a type of event is in the log; anything else is information."""
 
 

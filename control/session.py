@@ -22,6 +22,8 @@ from robotctl.safety.shaper import Clip
 HISTORY_S = 60.0
 """How much the ring of ticks remembers: the black box."""
 _ANSWER_TIMEOUT_S = 5.0
+_RESET_TIMEOUT_S = 600.0
+"""The loop gives a reset up much earlier."""
 _OFF = (State.OFF, State.SILENT, State.READY, State.FAULT)
 _STOPPED = (State.HOLD, State.FAULT, State.READY, State.SILENT)
 
@@ -48,8 +50,11 @@ class Session(ABC):
         self.judge = Judge(robot)
         self.statistics = TickStatistics(robot.period_ns)
         self.trips: list[dict[str, Any]] = []
+        self.pages: list[str] = []
+        """Why the operator was called for."""
         self.on_event: Callable[[dict[str, Any]], None] | None = None
         self.on_trip: Callable[[dict[str, Any]], None] | None = None
+        self.on_page: Callable[[str], None] | None = None
         self.on_poll: Callable[[], None] | None = None
         self._answers: dict[int, dict[str, Any]] = {}
         self._tick_cursor = 0
@@ -131,17 +136,28 @@ class Session(ABC):
             self.trips.append(event)
             if self.on_trip is not None:
                 self.on_trip(event)
+        elif event["type"] == "page":
+            self.page(event["text"])
+
+    def page(self, why: str) -> None:
+        """Call for the operator."""
+        self.pages.append(why)
+        if self.on_page is not None:
+            self.on_page(why)
 
     # -- asking ---------------------------------------------------------------------------------------------------
 
-    def request(self, verb: Verb) -> None:
+    def request(self, verb: Verb, argument: int = 0) -> None:
         """Ask the loop for something and wait for its answer.
+
+        Args:
+            argument: what the verb says it takes.
 
         Raises:
             Stopped: if the present state does not allow it.
             HardwareError: if the loop does not answer.
         """
-        number = self.link.desk.ask(verb)
+        number = self.link.desk.ask(verb, argument)
         self._wait(lambda: number in self._answers, _ANSWER_TIMEOUT_S, f"the loop did not answer {verb.name}")
         answer = self._answers.pop(number)
         if not answer["ok"]:
@@ -161,14 +177,20 @@ class Session(ABC):
             raise Stopped(f"expected {names}, but the supervisor is in {self.state.name}{cause}")
         return self.state
 
-    def reset(self, routine: Verb = Verb.HOME) -> None:
+    def reset(self, routine: Verb = Verb.HOME, argument: int = 0) -> None:
         """Run a reset routine to its end.
+
+        One that does not arrive is tried again, twice, by the loop. After that, and after any trip on the way, the
+        operator is called for, and nothing is acknowledged in his place.
+
+        Args:
+            argument: the seed, for RANDOM_START.
 
         Raises:
             Stopped: if it is refused, or ends in anything but ARMED.
         """
-        self.request(routine)
-        self.wait_for(State.ARMED, timeout_s=90.0)
+        self.request(routine, argument)
+        self.wait_for(State.ARMED, timeout_s=_RESET_TIMEOUT_S)
 
     def prepare(self) -> None:
         """Arm, retreat if the arm stands outside its limits, and go home."""

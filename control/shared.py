@@ -26,6 +26,9 @@ from robotctl.safety.target import FreeDrive, Hold, JointTorque, JointVelocity, 
 MAX_VALUES = 16
 """Most values a target may carry through a mailbox."""
 
+_HEADER = 128
+"""Bytes of a board before its rings."""
+
 Buffer = mmap.mmap | bytearray
 _TARGET = struct.Struct(f"<Qqqqii{MAX_VALUES}d")
 """version, epoch, seq, deadline, kind, count, values"""
@@ -93,17 +96,18 @@ class Desk:
     emergency stop has a word of its own: pressed in another thread, it must neither lose nor replace a request.
     """
 
-    SIZE = 48
-    """Words: asked, answered, verb, stops, beats, grip. The answer's text goes through the event ring."""
+    SIZE = 56
+    """Words: asked, answered, verb, stops, beats, grip, argument. The answer's text goes through the event ring."""
 
     def __init__(self, buffer: Buffer, offset: int = 0) -> None:
         self._words = _words(buffer, offset, self.SIZE // 8)
         self._stops = 0
 
-    def ask(self, verb: int) -> int:
+    def ask(self, verb: int, argument: int = 0) -> int:
         """Post a request and return its number. For one thread only."""
         number = self._words[0] + 1
         self._words[2] = verb
+        self._words[6] = argument
         self._words[0] = number
         return number
 
@@ -114,6 +118,11 @@ class Desk:
         """Return (number, verb) of a request that waits, else None."""
         asked = self._words[0]
         return (asked, self._words[2]) if asked != self._words[1] else None
+
+    @property
+    def argument(self) -> int:
+        """What the request that waits was asked with."""
+        return self._words[6]
 
     def answer(self, number: int) -> None:
         self._words[1] = number
@@ -361,14 +370,14 @@ class Link:
             Mailbox(mailbox),
             Desk(board, 0),
             Watch(board, Watch.OFFSET),
-            EventRing(board, 64),
-            TickRing(board, 64 + EventRing.SIZE, dof, slots),
+            EventRing(board, _HEADER),
+            TickRing(board, _HEADER + EventRing.SIZE, dof, slots),
             fds,
         )
 
     @staticmethod
     def _board_size(dof: int, slots: int) -> int:
-        return 64 + EventRing.SIZE + TickRing.size(dof, slots)
+        return _HEADER + EventRing.SIZE + TickRing.size(dof, slots)
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,7 +391,7 @@ class Board:
     def attach(cls, fd: int, dof: int, slots: int) -> Self:
         """Map the board behind a descriptor, which may be read-only, so that it cannot be written to."""
         board = mmap.mmap(fd, Link._board_size(dof, slots), access=mmap.ACCESS_READ)
-        return cls(EventRing(board, 64), TickRing(board, 64 + EventRing.SIZE, dof, slots))
+        return cls(EventRing(board, _HEADER), TickRing(board, _HEADER + EventRing.SIZE, dof, slots))
 
     @staticmethod
     def read_only(fd: int) -> int:

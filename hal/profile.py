@@ -278,6 +278,8 @@ class Twin(_Strict):
     """Standard deviation of measured velocities, rad/s."""
     payload: NotNegative = 0.0
     """Mass at the tool that the controller is not told of, kg."""
+    start: list[Finite] | None = None
+    """Where the arm stands when it wakes up, rad; None for the rest pose. It may be outside the limits."""
 
 
 class RobotProfile(_Strict):
@@ -310,11 +312,25 @@ class RobotProfile(_Strict):
     """Planes and boxes where neither tool point nor moving links may be."""
     collision: Collision | None = Collision()
     """None turns the watch for contact off: for a model without geometry."""
+    home_via: list[list[Finite]] = []
+    """Poses on the way home, in order, rad."""
+    start_spread: NotNegative = 0.2
+    """How far from home a random start may be, for each joint, rad."""
+
+    @property
+    def poses(self) -> dict[str, list[float]]:
+        """Every pose that the arm is led to, by its key."""
+        return {
+            "home": self.home,
+            "rest": self.rest,
+            **{f"home_via.{index}": pose for index, pose in enumerate(self.home_via)},
+        }
 
     @model_validator(mode="after")
     def _consistent(self) -> "RobotProfile":
-        for key in ("home", "rest"):
-            pose = getattr(self, key)
+        if self.twin.start is not None and len(self.twin.start) != len(self.joints):
+            raise ValueError(f"twin.start: {len(self.twin.start)} values for {len(self.joints)} joints")
+        for key, pose in self.poses.items():
             if len(pose) != len(self.joints):
                 raise ValueError(f"{key}: {len(pose)} values for {len(self.joints)} joints")
             for value, joint in zip(pose, self.joints, strict=True):

@@ -9,6 +9,7 @@ from robotctl.hal.can.damiao.motors import MOTORS
 from robotctl.hal.description import Description, load_description, locate
 from robotctl.hal.document import read_document
 from robotctl.hal.errors import ConfigError
+from robotctl.hal.limits_text import digest, limits_text
 from robotctl.hal.profile import Joint, RobotProfile
 from robotctl.hal.types import Vector, frozen
 
@@ -64,6 +65,16 @@ class Robot:
     def period_ns(self) -> int:
         """Servo period."""
         return round(1e9 / self.profile.servo_hz)
+
+    @property
+    def limits_text(self) -> str:
+        """Everything that limits the arm, one line per value."""
+        return limits_text(self.profile, self.description)
+
+    @property
+    def limits_hash(self) -> str:
+        """Stands for `limits_text`: equal where that is."""
+        return digest(self.limits_text)
 
     @property
     def stopping_time_s(self) -> float:

@@ -166,6 +166,7 @@ def report(session: Session, outcome: Outcome, about: dict[str, Any], recording:
                 }
                 for trip in session.trips
             ],
+            "pages": session.pages,
             "violations": session.judge.violations,
             "worst_excess": {
                 key: round(value, 6) for key, value in session.judge.worst.items() if math.isfinite(value)

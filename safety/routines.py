@@ -1,10 +1,11 @@
 """Reset routines: small motions the supervisor runs by itself, through the same limiter and shaper as a policy.
 
-| | routine   | what it does                                                            |
-|-|-----------|-------------------------------------------------------------------------|
-|R0| `Settle`  | waits for measured standstill                                           |
-|R1| `Retreat` | leads joints, tool and links back inside, at a tenth of the caps        |
-|R2| `Goto`    | leads the joints straight to a pose (home, rest)                        |
+| | routine       | what it does                                                        |
+|-|---------------|---------------------------------------------------------------------|
+|R0| `Settle`      | waits for measured standstill                                       |
+|R1| `Retreat`     | leads joints, tool and links back inside, at a tenth of the caps    |
+|R2| `Goto`        | leads the joints straight to a pose (home, rest)                    |
+|R4| `RandomStart` | the same, to a pose drawn around home                               |
 """
 
 from abc import ABC, abstractmethod
@@ -12,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
 from robotctl.safety.proximity import NothingNear, Scene
@@ -27,8 +29,11 @@ _CRAWL = 0.2
 """Part of that which it uses at least, so that the end is reached."""
 _RETREAT_DEPTH = 0.01
 """How far inside a boundary a retreat ends, m and rad."""
-_RETREAT_CLEARANCE = 2e-3
+_CLEARANCE = 2e-3
 """Beyond what the shaper keeps, m. No more, since some links are never far from each other."""
+_START_ROOM = 0.02
+"""How far inside every region the tool is at a random start, m."""
+_DRAWS = 100
 
 
 class Geometry(Protocol):
@@ -77,7 +82,7 @@ class Retreat(Routine):
         self._geometry = geometry
         self._regions = regions(robot.profile, safety.sphere_margin)
         self._scene = scene or NothingNear(robot.dof)
-        self._clear = safety.proximity_stop + safety.proximity_margin + _RETREAT_CLEARANCE
+        self._clear = safety.proximity_stop + safety.proximity_margin + _CLEARANCE
 
     def velocity(self, sample: Sample, position: Vector) -> Vector | None:
         inside = np.minimum(np.maximum(position, self._lower), self._upper)
@@ -102,10 +107,11 @@ class Retreat(Routine):
 class Goto(Routine):
     """R2: a straight line in joint space, all joints arriving together."""
 
+    timeout_s = 60.0
+
     def __init__(self, robot: Robot, pose: Vector, name: str, geometry: Geometry) -> None:
         safety = robot.profile.safety
         self.name = name
-        self.timeout_s = 60.0
         self._pose = pose
         self._cap = safety.reset_scale * robot.limits.velocity
         self._tool_speed = safety.reset_tool_speed
@@ -119,3 +125,33 @@ class Goto(Routine):
         _, jacobian = self._geometry.tool_and_jacobian(position)
         speed = float(np.linalg.norm(jacobian @ wanted)) / self._tool_speed
         return wanted / max(1.0, speed, float((np.abs(wanted) / self._cap).max()))
+
+
+class RandomStart(Goto):
+    """R4: to a pose drawn evenly from the box of `start_spread` around home; the same for the same seed."""
+
+    def __init__(self, robot: Robot, seed: int, geometry: Geometry, scene: Scene | None = None) -> None:
+        """Draw the pose, again if a joint, the tool or a link would be where a policy should not begin.
+
+        Raises:
+            ConfigError: if the seed is negative, or the box holds hardly a pose that may be.
+        """
+        if seed < 0:
+            raise ConfigError(f"seed {seed} is negative", "use one from 0 on")
+        pose = _draw(robot, np.random.default_rng(seed), geometry, scene or NothingNear(robot.dof))
+        super().__init__(robot, pose, f"random start {seed}", geometry)
+
+
+def _draw(robot: Robot, rng: np.random.Generator, geometry: Geometry, scene: Scene) -> Vector:
+    profile, limits, safety = robot.profile, robot.limits, robot.profile.safety
+    allowed = regions(profile, safety.sphere_margin + _START_ROOM)
+    clear = safety.proximity_stop + safety.proximity_margin + _CLEARANCE
+    for _ in range(_DRAWS):
+        pose = profile.home + rng.uniform(-profile.start_spread, profile.start_spread, robot.dof)
+        room = np.minimum(pose - limits.lower, limits.upper - pose).min() - safety.position_margin
+        tool, _ = geometry.tool_and_jacobian(pose)
+        if min(room, *(region.room(tool) for region in allowed)) < 0.0:
+            continue
+        if (scene.measure(pose, range(len(scene.pairs))) >= clear).all():
+            return np.asarray(pose)
+    raise ConfigError(f"no random start found in {_DRAWS} draws", "make start_spread smaller, or move home inwards")

@@ -40,7 +40,7 @@ class Plant:
     """
 
     def __init__(self, robot: Robot, start_ns: int = 0) -> None:
-        """Build the plant in the profile's rest pose, all drives off."""
+        """Build the plant at rest where the profile says, all drives off."""
         profile = robot.profile
         self.time_ns = start_ns
         self.dof = robot.dof
@@ -76,7 +76,7 @@ class Plant:
         for axis in range(self.axes):
             self.release(axis)
             self._hold(axis)
-        self.place(np.array(profile.rest))
+        self.place(np.array(profile.twin.start or profile.rest))
 
     def place(self, position: Vector) -> None:
         """Put the arm at rest at `position`, rad. For starts and tests; a real arm has no such thing."""

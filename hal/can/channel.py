@@ -7,9 +7,11 @@ imports no simulation. Nothing is sent by opening.
 import errno
 import importlib
 import logging
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 import can
@@ -55,6 +57,16 @@ def is_shared(name: str) -> bool:
     interface, _, where = name.partition(":")
     private = {entry.name for entry in entry_points(group="robotctl.channels")} | {"virtual"}
     return bool(where) and interface not in private
+
+
+def may_be_real(name: str) -> bool:
+    """Return whether there may be real drives behind a channel: at a pseudo-terminal or a virtual interface is none."""
+    interface, _, where = name.partition(":")
+    if interface == "slcan" and os.path.realpath(where).startswith("/dev/pts/"):
+        return False
+    if interface == "socketcan" and Path("/sys/devices/virtual/net", where).exists():
+        return False
+    return is_shared(name)
 
 
 def prepare_channel(name: str) -> None:

@@ -7,8 +7,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from robotctl.cli import run as run_module
 from robotctl.cli.main import app
-from robotctl.hal.robot import profile_path
+from robotctl.hal.robot import load_robot, profile_path
+from robotctl.safety.routines import Goto
 
 
 def robotctl(folder: Path, *arguments: str) -> tuple[Result, dict[str, Any]]:
@@ -146,3 +148,48 @@ def test_a_report_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 2
     assert "cannot write /nowhere/r.json" in result.output
+
+
+def test_a_reset_that_fails_calls_for_the_operator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Goto, "timeout_s", 1.0)
+    settings = ["--set", "twin.start=[0.9, -0.4, 0.0, -2.2, 0.0, 1.9, 0.785]", "--set", "safety.reset_scale=0.01"]
+    result, report = robotctl(tmp_path, *settings)
+    assert result.exit_code == 3, result.output
+    assert "operator, please: P29: reset routine 'home' did not arrive in 3 tries of 1 s" in result.output
+    assert [page.split(":")[0] for page in report["safety"]["pages"]] == ["P29"]
+    assert report["episodes"] == []
+
+
+def test_real_drives_do_not_move_before_their_limits_are_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setattr(run_module, "may_be_real", lambda channel: True)
+    arm = ["--backend", "can", "--episodes", "1"]
+    result, _ = robotctl(tmp_path, *arm)
+    assert result.exit_code == 2
+    assert "the limits of panda have not been acknowledged" in result.output
+    assert "try: read this; if it is what the arm should be held to, run again with --accept-limits" in result.output
+    assert not (tmp_path / "run.mcap").exists()
+    result, report = robotctl(tmp_path, *arm, "--accept-limits")
+    assert result.exit_code == 0, result.output
+    assert report["limits_hash"] == load_robot("panda").limits_hash
+    (tmp_path / "run.mcap").unlink()
+    result, report = robotctl(tmp_path, *arm)
+    assert result.exit_code == 0, result.output
+    (tmp_path / "run.mcap").unlink()
+    result, _ = robotctl(tmp_path, *arm, "--set", "sphere.radius=0.41")
+    assert result.exit_code == 2
+    assert "- sphere.radius: 0.42\n+ sphere.radius: 0.41\n" in result.output
+
+
+def test_emulated_drives_and_the_twin_ask_for_no_acknowledgement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    for backend in ("sim", "can"):
+        folder = tmp_path / backend
+        folder.mkdir()
+        result, _ = robotctl(folder, "--backend", backend, "--episodes", "1")
+        assert result.exit_code == 0, result.output
+    assert not (tmp_path / "robotctl").exists()

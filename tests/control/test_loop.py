@@ -180,9 +180,10 @@ def bench(panda):
 
 # -- verbs ---------------------------------------------------------------------------------------------------------
 
+RESETS = {Verb.HOME, Verb.PARK, Verb.RETREAT, Verb.SETTLE, Verb.RANDOM_START}
 ALLOWED = {
     State.READY: {Verb.ARM, Verb.CLOSE},
-    State.ARMED: {Verb.START, Verb.HOME, Verb.PARK, Verb.RETREAT, Verb.SETTLE, Verb.STOP, Verb.DISARM},
+    State.ARMED: {Verb.START, Verb.STOP, Verb.DISARM, *RESETS},
     State.RUN: {Verb.STOP, Verb.DISARM},
     State.RESET: {Verb.STOP, Verb.DISARM},
     State.STOPPING: {Verb.STOP, Verb.DISARM},
@@ -524,7 +525,7 @@ def test_armed_outside_its_limits_it_may_do_nothing_but_retreat(bench):
     bench.tick(20)
     assert bench.supervisor.state is State.ARMED
     assert int(bench.link.ticks.latest()["clip"]) & Clip.RECOVERY
-    for verb in (Verb.START, Verb.HOME, Verb.PARK, Verb.SETTLE):
+    for verb in (Verb.START, *(RESETS - {Verb.RETREAT})):
         assert "refused" in bench.ask(verb)
     assert bench.truth.position[4] > bench.robot.limits.upper[4]
     assert bench.ask(Verb.RETREAT) == ""

@@ -29,7 +29,9 @@ def test_home_and_rest_have_to_be_where_the_tool_may_be(key: str) -> None:
 def test_home_has_to_be_where_the_links_may_be(half: float, settings: tuple[str, ...]) -> None:
     """A post beside the elbow, 33, 14 or 5 mm away; 8 mm are kept by default, 16 mm with that margin."""
     build(POST % 0.03, *settings)
-    with pytest.raises(ConfigError, match=r"panda.yaml: home: panda_link3 and post would be \d+ mm apart\n  try: change"):
+    with pytest.raises(
+        ConfigError, match=r"panda.yaml: home: panda_link3 and post would be \d+ mm apart\n  try: change"
+    ):
         build(POST % half, *settings)
     build(POST % half, *settings, "collision=null")
     build(POST % half, *settings, "collision.ignore=[[panda_link3, post]]")

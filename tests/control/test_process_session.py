@@ -14,8 +14,8 @@ from robotctl.control import registry
 from robotctl.control.loop import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.shared import Board
-from robotctl.hal.errors import HardwareError
-from robotctl.hal.robot import Robot
+from robotctl.hal.errors import ConfigError, HardwareError
+from robotctl.hal.robot import Robot, load_robot, profile_path
 from robotctl.safety.machine import State
 
 pytestmark = pytest.mark.realtime
@@ -174,3 +174,28 @@ def test_neither_a_reader_that_stands_still_nor_memory_that_is_closed_holds_the_
             assert session.link.ticks.head - before > 400
             assert session.state is State.ARMED
             viewer.kill()
+
+
+def test_limits_that_changed_since_they_were_seen_are_refused_line_by_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROBOTCTL_RUNTIME_DIR", str(tmp_path))
+    path = tmp_path / "panda.yaml"
+    path.write_text(profile_path("panda").read_text())
+    session = ProcessSession(load_robot(str(path)), "sim")
+    path.write_text(path.read_text().replace("radius: 0.42", "radius: 0.52"))
+    with pytest.raises(ConfigError, match=r"panda.yaml: limits changed while it was being started") as caught, session:
+        pass
+    assert "\n- sphere.radius: 0.42\n+ sphere.radius: 0.52\n" in str(caught.value)
+    assert session._process is not None
+    assert session._process.returncode == 2
+
+
+def test_what_limits_nothing_may_be_edited_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOTCTL_RUNTIME_DIR", str(tmp_path))
+    path = tmp_path / "panda.yaml"
+    path.write_text(profile_path("panda").read_text())
+    session = ProcessSession(load_robot(str(path)), "sim")
+    path.write_text(path.read_text().replace("title: Franka", "title: My"))
+    with session:
+        assert session.state is State.READY

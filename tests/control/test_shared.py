@@ -152,6 +152,15 @@ def test_a_request_waits_until_it_is_answered():
     assert desk.ask(8) == number + 1
 
 
+def test_a_request_carries_an_argument():
+    buffer = bytearray(Desk.SIZE)
+    operator, loop = Desk(buffer), Desk(buffer)
+    operator.ask(7, 2**40)
+    assert loop.argument == 2**40
+    operator.ask(8)
+    assert loop.argument == 0
+
+
 def test_a_new_request_takes_the_place_of_one_that_nobody_answered():
     desk = Desk(bytearray(Desk.SIZE))
     first = desk.ask(1)

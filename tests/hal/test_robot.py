@@ -63,6 +63,9 @@ def test_arrays_are_read_only(panda: Robot) -> None:
         ("name: panda_joint1", "name: panda_elbow", r"'panda_elbow' is not in the model"),
         ("home: [0.0,", "home: [9.0,", r"outside its limits"),
         ("home: [0.0, -0.4,", "home: [0.0,", r"6 values for 7 joints"),
+        ("brakes: true", "home_via: [[0.0, 0.1], [0.0]]\nbrakes: true", r"home_via.0: 2 values for 7 joints"),
+        ("brakes: true", "twin: {start: [0.0]}\nbrakes: true", r"twin.start: 1 values for 7 joints"),
+        ("brakes: true", "start_spread: -0.1\nbrakes: true", r"panda.yaml:\d+: start_spread"),
         (
             "brakes: true",
             "brakes: true\nkeep_out: [{kind: plane, name: a, point: [0, 0, 0], normal: [0, 0, 0]}]",

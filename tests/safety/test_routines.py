@@ -5,10 +5,11 @@ import pytest
 
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import VelocityLimiter
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Sample
 from robotctl.safety.region import regions
-from robotctl.safety.routines import Goto, Retreat, Settle
+from robotctl.safety.routines import Goto, RandomStart, Retreat, Settle
 from robotctl.safety.shaper import Shaper
 
 
@@ -258,3 +259,79 @@ def test_settle_waits_for_every_measured_joint(robot: Robot, side):
         velocity[joint] = side * (still - 1e-9)
         assert routine.velocity(sample(home, velocity), home) is None
     assert routine.timeout_s > robot.stopping_time_s
+
+
+def drawn(robot, seed, kinematics):
+    return RandomStart(robot, seed, kinematics)._pose
+
+
+def test_random_starts_follow_their_seed(robot: Robot, kinematics: Kinematics):
+    assert np.array_equal(drawn(robot, 0, kinematics), drawn(robot, 0, Kinematics(robot)))
+    assert not np.array_equal(drawn(robot, 0, kinematics), drawn(robot, 1, kinematics))
+    assert RandomStart(robot, 7, kinematics).name == "random start 7"
+
+
+def test_random_starts_fill_the_box_around_home(panda: Robot):
+    kinematics = Kinematics(panda)
+    away = np.array([drawn(panda, seed, kinematics) for seed in range(200)]) - panda.profile.home
+    assert (np.abs(away) <= 0.2).all()
+    assert (away.min(axis=0) < -0.15).all()
+    assert (away.max(axis=0) > 0.15).all()
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_random_starts_keep_the_soft_limits(side):
+    robot = load_robot("panda", ["start_spread=0.1", "safety.position_margin=0.02"])
+    edge = robot.limits.upper[6] if side > 0 else robot.limits.lower[6]
+    home = [*robot.profile.home[:6], float(edge - side * 0.05)]
+    robot = load_robot("panda", ["start_spread=0.1", "safety.position_margin=0.02", f"home={home}"])
+    kinematics = Kinematics(robot)
+    room = np.array([side * (edge - drawn(robot, seed, kinematics)[6]) for seed in range(200)])
+    assert room.min() >= 0.02
+    assert room.min() < 0.025
+    assert room.max() > 0.14
+
+
+def test_random_starts_stay_inside_every_region():
+    wall = "keep_out=[{kind: plane, name: wall, point: [0.0, 0.1, 0.0], normal: [0.0, -1.0, 0.0]}]"
+    robot = load_robot("panda", [wall, "start_spread=0.3"])
+    kinematics = Kinematics(robot)
+    tools = np.array([kinematics.tool(drawn(robot, seed, kinematics)) for seed in range(200)])
+    allowed = 0.1 - 0.02 - robot.profile.safety.sphere_margin
+    assert tools[:, 1].max() <= allowed
+    assert tools[:, 1].max() > allowed - 0.01
+
+
+def test_a_random_start_that_is_hardly_ever_inside_is_refused(panda: Robot):
+    robot = load_robot("panda", ["sphere.radius=0.021"])
+    with pytest.raises(ConfigError, match="no random start found in 100 draws"):
+        RandomStart(robot, 0, Kinematics(robot))
+    with pytest.raises(ConfigError, match="seed -1 is negative"):
+        RandomStart(panda, -1, Kinematics(panda))
+
+
+def test_a_random_start_is_led_to(panda: Robot):
+    kinematics = Kinematics(panda)
+    routine = RandomStart(panda, 5, kinematics)
+    positions, _, _ = lead(panda, kinematics, routine, panda.profile.home)
+    assert positions[-1] == pytest.approx(drawn(panda, 5, kinematics), abs=2e-3)
+
+
+class Wall:
+    """One pair, with clearance where the first joint is turned to the left."""
+
+    pairs = (("link", "wall"),)
+
+    def __init__(self, robot: Robot):
+        self.home = robot.profile.home[0]
+        self.reach = np.zeros((1, robot.dof))
+
+    def measure(self, position, pairs):
+        return np.array([position[0] - self.home])[list(pairs)]
+
+
+def test_random_starts_keep_links_apart(panda: Robot):
+    kinematics, safety = Kinematics(panda), panda.profile.safety
+    clear = safety.proximity_stop + safety.proximity_margin + 2e-3
+    away = [RandomStart(panda, seed, kinematics, Wall(panda))._pose[0] - panda.profile.home[0] for seed in range(200)]
+    assert clear <= min(away) < clear + 5e-3

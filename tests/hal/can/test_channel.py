@@ -1,6 +1,7 @@
 """Channels by name: which of them other processes reach, and what opening one costs."""
 
 import sys
+from pathlib import Path
 
 import can
 import pytest
@@ -20,6 +21,18 @@ def test_what_other_processes_reach_is_shared(name: str) -> None:
 @pytest.mark.parametrize("name", ["", "emulated", "virtual:arm", "emulated:x", "slcan:"])
 def test_what_lives_in_one_process_is_not(name: str) -> None:
     assert not channel.is_shared(name)
+
+
+@pytest.mark.parametrize("name", ["socketcan:can0", "slcan:/dev/ttyACM0", "pcan:PCAN_USBBUS1"])
+def test_where_drives_may_be_real(name: str) -> None:
+    assert channel.may_be_real(name)
+
+
+def test_no_drives_are_real_at_a_pseudo_terminal_or_a_virtual_interface(tmp_path: Path) -> None:
+    link = tmp_path / "adapter"
+    link.symlink_to("/dev/pts/0")
+    for name in ("", "emulated", "virtual:arm", "slcan:/dev/pts/7", f"slcan:{link}", "socketcan:lo"):
+        assert not channel.may_be_real(name), name
 
 
 @pytest.mark.parametrize("interface", ["slcan", "socketcan"])
