@@ -17,7 +17,7 @@ from robotctl.cli.errors import Exit, hear_interrupts, readable_errors
 from robotctl.cli.keys import stop_keys
 from robotctl.cli.output import write_json
 from robotctl.control.acknowledgement import acknowledge, require_acknowledged
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.recording_session import SessionRecording, record_session
 from robotctl.control.session import LockstepSession, Session

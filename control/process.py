@@ -11,7 +11,8 @@ import sys
 from dataclasses import asdict, dataclass
 
 from robotctl.control import registry
-from robotctl.control.loop import Loop, Verb
+from robotctl.control.loop import Loop
+from robotctl.control.operator import Verb
 from robotctl.control.process_tools import go_real_time, name_process, signal_on_parent_death
 from robotctl.control.shared import Link, Power
 from robotctl.hal.backend import open_backend

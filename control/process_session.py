@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from robotctl.control import registry
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.process import ProcessConfig
 from robotctl.control.rehearsal import Rehearsal, rehearse
 from robotctl.control.session import Session, Stopped, history_slots

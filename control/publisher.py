@@ -24,6 +24,7 @@ class Publisher:
         self._ticks = 0
         self._reported = 0
         self._state = State.OFF
+        self._warning = ""
         nothing = np.zeros(dof)
         self._no_truth = Truth(nothing, nothing, nothing, np.zeros(3))
 
@@ -34,6 +35,12 @@ class Publisher:
     def page(self, text: str, now_ns: int) -> None:
         """Call for the operator, who may not be looking: a reset ended in a stop."""
         self._link.events.write({"type": "page", "stamp_ns": now_ns, "text": text})
+
+    def warn(self, text: str, now_ns: int) -> None:
+        """Write a line for people when there is something new to warn of; "" is nothing."""
+        if text and text != self._warning:
+            self.log(f"warning: {text}", now_ns)
+        self._warning = text
 
     def report(self, supervisor: Supervisor, now_ns: int) -> None:
         """Write an event for every new trip, and one if the state changed."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.session import LockstepSession, Session, Stopped
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector

@@ -8,7 +8,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from robotctl.control.loop import Loop, Verb
+from robotctl.control.loop import Loop
+from robotctl.control.operator import Verb
 from robotctl.control.shared import Link
 from robotctl.control.statistics import TickStatistics
 from robotctl.hal.backend import open_backend

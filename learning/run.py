@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from robotctl.control.kinematics import Kinematics
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.recording_session import SessionRecording
 from robotctl.control.session import Session, Stopped
 from robotctl.hal.types import Vector

@@ -7,7 +7,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from robotctl.control.loop import Loop, Verb
+from robotctl.control.loop import Loop
+from robotctl.control.operator import Verb
 from robotctl.control.shared import Link
 from robotctl.hal.backend import Rig, open_backend
 from robotctl.hal.can.damiao.arm import DamiaoArm

@@ -4,7 +4,7 @@ from enum import Enum
 
 import numpy as np
 
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.safety.machine import State
 from robotctl.safety.shaper import Clip
 from robotctl.trials.bench import Bench

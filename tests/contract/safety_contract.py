@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.session import LockstepSession, Stopped
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Vector

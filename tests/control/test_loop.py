@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from robotctl.control.loop import Loop, Verb
+from robotctl.control.loop import Loop
+from robotctl.control.operator import Verb
 from robotctl.control.session import LockstepSession, Stopped
 from robotctl.control.shared import Link, Power
 from robotctl.hal.arm import Arm
@@ -890,3 +891,15 @@ def test_an_arm_that_nobody_watches_does_not_move_on(bench, state, shows_life):
     labels = [trip.protection.label for trip in bench.supervisor.trips]
     assert labels == (["P27"] if shows_life and state is State.RUN else [])
     assert all(trip.category is Category.BRAKE_HOLD for trip in bench.supervisor.trips)
+
+
+def test_a_drive_that_gets_hot_is_warned_of_once(bench):
+    bench.reach(State.ARMED)
+    warm = np.full(7, 30.0)
+    warm[3] = 85.0
+    bench.arm.alter = lambda sample: sample._replace(temperature=warm)
+    bench.events()
+    bench.tick(5)
+    warnings = [event["text"] for event in bench.events() if event["type"] == "log"]
+    assert warnings == ["warning: panda_joint4 is at 85 degrees C"]
+    assert bench.supervisor.state is State.ARMED

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from robotctl.control import registry
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.shared import Board
 from robotctl.hal.errors import ConfigError, HardwareError

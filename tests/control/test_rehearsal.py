@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.rehearsal import Rehearsal, rehearse
 from robotctl.control.session import LockstepSession, Stopped

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.control.session import LockstepSession, Stopped
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot, load_robot

@@ -279,7 +279,7 @@ def test_hostile_wishes_bring_no_pair_too_near(robot: Robot, policy: str, around
 
 @pytest.mark.parametrize("watched", [True, False])
 def test_an_elbow_is_kept_out_where_the_tool_is_far_away(watched: bool) -> None:
-    """The elbow swings about the line from shoulder to tool, against a beam at its side; the tool stays at its place."""
+    """The elbow swings about the line from shoulder to tool, against a beam at its side; the tool stays put."""
     beam = "{kind: box, name: beam, centre: [-0.05, 0.28, 0.6], half: [0.3, 0.02, 0.02]}"
     robot = load_robot("panda", [f"keep_out=[{beam}]"])
     scene = CollisionModel(robot, Kinematics(robot))

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.hal.can.damiao.arm import DamiaoArm
 from robotctl.hal.can.damiao.codec import Special, encode_special
 from robotctl.hal.errors import HardwareError
@@ -45,7 +45,7 @@ def _too_fast(bench: Bench, values: np.ndarray, axis: int) -> float:
     return _OVER * float(bench.robot.limits.velocity[axis]) * (1.0 if values[axis] >= 0.0 else -1.0)
 
 
-def _jump(bench: Bench, values: np.ndarray, axis: int) -> float:
+def _jump(_bench: Bench, values: np.ndarray, axis: int) -> float:
     return float(values[axis]) + 0.05
 
 
@@ -55,7 +55,7 @@ def _too_hard(bench: Bench, values: np.ndarray, axis: int) -> float:
     return float(values[axis] - np.sign(values[axis]) * change)
 
 
-def _too_strong(bench: Bench, values: np.ndarray, axis: int) -> float:
+def _too_strong(bench: Bench, _values: np.ndarray, axis: int) -> float:
     return _OVER * float(bench.robot.limits.torque[axis])
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robotctl.control.loop import Verb
+from robotctl.control.operator import Verb
 from robotctl.hal.robot import Robot
 from robotctl.safety.deadman import Grip
 from robotctl.safety.machine import State
