@@ -109,14 +109,12 @@ def survey(package: Package) -> Survey:
         return pickle.loads(answer.read_bytes())
 
 
-def cases(package: Package, seen: Survey, only: str | None = None) -> list[Case]:
-    """Return the mutants of all files, or of one, that make sense; ids are `FILE:LINE#NUMBER`."""
+def cases(package: Package, seen: Survey, files: Iterable[str]) -> list[Case]:
+    """Return the mutants of some files that make sense; ids are `FILE:LINE#NUMBER`."""
     found = []
-    for file, tree in package.trees.items():
-        if only not in (None, file):
-            continue
+    for file in files:
         numbers: dict[int, int] = {}
-        for mutant in find(tree):
+        for mutant in find(package.trees[file]):
             if mutant.between and not seen.integers[file].issuperset(mutant.between):
                 continue
             numbers[mutant.line] = numbers.get(mutant.line, 0) + 1
