@@ -33,22 +33,23 @@ ROOT = Path(__file__).parents[2]
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.mutation", description="Mutation test of safety/.")
-    parser.add_argument("--only", metavar="FILE", help="mutate one file of safety/, e.g. shaper.py")
+    parser.add_argument("--only", nargs="+", metavar="FILE", help="mutate some files of safety/, e.g. shaper.py")
     parser.add_argument("--mutant", metavar="ID", help="run one mutant and show what pytest says, e.g. shaper.py:95#2")
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time (default: 2)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures and the survivors")
     options = parser.parse_args()
     package = Package("robotctl.safety", ROOT / "safety", ROOT / "tests/safety", ROOT)
-    only = options.mutant.split(":")[0] if options.mutant else options.only
-    if only not in {None, *package.trees}:
-        parser.error(f"{only} is no file of safety/")
+    files = [options.mutant.split(":")[0]] if options.mutant else options.only or list(package.trees)
+    for file in files:
+        if file not in package.trees:
+            parser.error(f"{file} is no file of safety/")
     began = time.monotonic()
     gc.freeze()  # a fork's collector need not look through what it inherits
     try:
         with tempfile.TemporaryDirectory() as compiled:
             sys.pycache_prefix, sys.dont_write_bytecode = compiled, False  # the forks import the same files
             seen = campaign.survey(package)
-            todo = campaign.cases(package, seen, only)
+            todo = campaign.cases(package, seen, files)
             if options.mutant:
                 return show_one(package, seen, todo, options.mutant)
             print(f"{len(todo)} mutants, {len(seen.durations)} tests", flush=True)
@@ -60,7 +61,7 @@ def main() -> int:
     except campaign.UnmutatedTestsFail:
         print("the tests fail on the unchanged modules; look with: python -m pytest tests/safety", file=sys.stderr)
         return 2
-    excuses = [excuse for excuse in EXCUSED if only in (None, excuse.file)]
+    excuses = [excuse for excuse in EXCUSED if excuse.file in files]
     return report(done, excuses, time.monotonic() - began, options.json)
 
 

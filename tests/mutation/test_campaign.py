@@ -52,7 +52,7 @@ campaign._ALLOWANCE_S = 0.3
 package = campaign.Package("toy", here / "toy", here / "tests", here)
 try:
     seen = campaign.survey(package)
-    done = list(campaign.run(package, seen, campaign.cases(package, seen), 2))
+    done = list(campaign.run(package, seen, campaign.cases(package, seen, package.trees), 2))
     print(json.dumps([[case.id, case.mutant.change, case.fate] for case in done]))
 except campaign.UnmutatedTestsFail:
     print(json.dumps("refused"))

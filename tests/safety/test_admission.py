@@ -139,6 +139,24 @@ def test_the_heartbeat_names_its_onset(admission: Admission) -> None:
     assert trip.category is Category.BRAKE_HOLD
 
 
+def test_a_new_policy_begins_with_any_sequence_number(admission: Admission) -> None:
+    admission.offer(velocity(seq=50), 0, 0)
+    admission.begin(5 * MS)
+    assert admission.fresh(5 * MS) is None
+    assert admission.heartbeat(105 * MS - 1) is None
+    assert admission.heartbeat(105 * MS) is not None
+    admission.offer(velocity(seq=0), 0, 5 * MS)
+    assert admission.seq == 0
+    assert admission.refused == 0
+
+
+def test_the_first_sequence_number_is_0(admission: Admission) -> None:
+    admission.offer(velocity(seq=-1), 0, 0)
+    assert admission.refused == 1
+    admission.offer(velocity(seq=0), 0, 0)
+    assert admission.refused == 1
+
+
 def test_before_the_first_target_there_is_none_and_none_is_awaited(admission: Admission) -> None:
     assert admission.fresh(-1) is None
     assert admission.heartbeat(-1) is None

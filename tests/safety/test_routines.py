@@ -223,6 +223,34 @@ def test_so_does_the_tool(panda: Robot, side, beyond, speed):
         assert wanted == pytest.approx([-side * speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], abs=1e-12)
 
 
+class Crowd:
+    """Two pairs of links: the clearance of the second grows with the third joint, at half a metre per radian."""
+
+    pairs = (("base", "post"), ("elbow", "table"))
+
+    def measure(self, position, pairs):
+        return np.array([1.0, 0.5 * position[2]])[list(pairs)]
+
+    def approach(self, position, pairs):
+        assert pairs in ([], [1])
+        return [np.array([0.0, 0.0, -0.5, 0.0, 0.0, 0.0, 0.0]) for _ in pairs]
+
+
+@pytest.mark.parametrize(
+    ("short", "speed"),  # of the clearance at which the retreat ends, m; and the speed of the joint, rad/s
+    [(0.1, 0.1), (0.01, 3.0 * 0.01 * 0.5 / 0.251), (0.001, 0.02), (1e-6, 0.02), (-1e-6, None)],
+)
+def test_links_that_are_too_near_are_led_apart(panda: Robot, short, speed):
+    safety = panda.profile.safety
+    position = np.array(panda.profile.home)
+    position[2] = 2.0 * (safety.proximity_stop + safety.proximity_margin + 0.002 - short)
+    wanted = Retreat(panda, Slide(SPHERE.centre), Crowd()).velocity(sample(position), position)
+    if speed is None:
+        assert wanted is None
+    else:
+        assert wanted == pytest.approx([0.0, 0.0, speed, 0.0, 0.0, 0.0, 0.0], abs=1e-12)
+
+
 def test_a_retreat_that_knows_no_way_stays_where_it_is(panda: Robot):
     position = np.array(panda.profile.home)
     above = np.array(SPHERE.centre) + np.array([0.0, 0.0, 1.0])  # the slide moves the tool along x only

@@ -7,7 +7,9 @@ import pytest
 
 from robotctl.hal.robot import load_robot
 from robotctl.hal.types import Fault, Sample
+from robotctl.safety.deadman import Grip
 from robotctl.safety.machine import ENABLED, Event, Refused, State
+from robotctl.safety.proximity import Scene
 from robotctl.safety.supervisor import Supervisor
 from robotctl.safety.target import Hold, JointVelocity
 from robotctl.safety.trip import Category, Protection, Trip
@@ -15,6 +17,7 @@ from robotctl.safety.trip import Category, Protection, Trip
 ROBOT = load_robot("panda")
 SAFETY = ROBOT.profile.safety
 HOME = np.array(ROBOT.profile.home)
+REST = np.zeros(7)
 CENTRE = np.array(ROBOT.profile.sphere.centre)
 MS = 1_000_000
 PERIOD = ROBOT.period_ns
@@ -34,8 +37,8 @@ MOVING = (State.ARMED, State.RUN, State.RESET)
 class Bench:
     """A supervisor, and the samples and time it is shown."""
 
-    def __init__(self, state: State) -> None:
-        self.supervisor = Supervisor(ROBOT)
+    def __init__(self, state: State, scene: Scene | None = None) -> None:
+        self.supervisor = Supervisor(ROBOT, scene)
         for event in PATHS[state]:
             self.supervisor.handle(event)
         self.supervisor.admission.renew(0)
@@ -557,3 +560,270 @@ def test_the_age_of_feedback_is_known_with_the_drives_off_too():
         bench.observe()
         assert (bench.supervisor.feedback.stale, bench.supervisor.feedback.lost) == (stale, lost)
     assert bench.supervisor.trips == []
+
+
+# -- what an event needs besides the right state -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("protection", Protection, ids=[p.name for p in Protection])
+def test_start_acknowledges_a_stop_only_where_the_protection_allows_that(protection):
+    supervisor = Bench(State.RUN).supervisor
+    supervisor.trip(a_trip(Category.BRAKE_HOLD, protection))
+    supervisor.handle(Event.STANDSTILL_HOLD)
+    before = supervisor.epoch
+    if protection in (Protection.MALFORMED, Protection.HEARTBEAT):
+        assert supervisor.handle(Event.START) is State.RUN
+        assert (supervisor.category, supervisor.cause) == (None, None)
+    else:
+        with pytest.raises(Refused, match=r"^START is refused in state HOLD: acknowledge first$"):
+            supervisor.handle(Event.START)
+        assert supervisor.state is State.HOLD
+        assert supervisor.cause is not None
+    assert supervisor.epoch == before
+
+
+def test_start_does_not_acknowledge_an_operators_stop():
+    supervisor = Bench(State.HOLD).supervisor
+    with pytest.raises(Refused, match="acknowledge first"):
+        supervisor.handle(Event.START)
+
+
+def test_in_recovery_only_the_retreat_is_started():
+    supervisor = Bench(State.ARMED).supervisor
+    supervisor.recovery = True
+    with pytest.raises(Refused, match="outside its limits; retreat first"):
+        supervisor.handle(Event.START)
+    assert supervisor.handle(Event.RESET) is State.RESET
+
+
+@pytest.mark.parametrize("event", [Event.START, Event.RESET])
+def test_nothing_is_started_while_the_deadmans_switch_is_not_held(event):
+    supervisor = Bench(State.ARMED).supervisor
+    supervisor.deadman.take(Grip.RELEASED, 0)
+    with pytest.raises(Refused, match="the deadman's switch is not held"):
+        supervisor.handle(event)
+    supervisor.deadman.take(Grip.HELD, 0)
+    supervisor.handle(event)
+
+
+def test_arming_and_stopping_need_no_deadmans_switch():
+    supervisor = Bench(State.READY).supervisor
+    supervisor.deadman.take(Grip.RELEASED, 0)
+    for event in (Event.ARM, Event.STOP, Event.DISARM):
+        supervisor.handle(event)
+
+
+def into_fault(bench, protection):
+    bench.supervisor.trip(a_trip(Category.BRAKE_OFF, protection))
+    for event in (Event.STANDSTILL_OFF, Event.OFF_FAULT):
+        bench.supervisor.handle(event)
+
+
+@pytest.mark.parametrize("protection", [Protection.DRIVE, Protection.FRAMES])
+def test_a_failed_drive_is_acknowledged_after_its_power_was_off(protection):
+    bench = Bench(State.RUN)
+    bench.age_ns[:] = 60 * MS  # power that was off before the fault does not count
+    bench.supervisor.feedback.check(Sample(0, HOME, REST, REST, -bench.age_ns), 0)
+    bench.age_ns[:] = 0
+    into_fault(bench, protection)
+    bench.observe()
+    for silent in ([3], range(6)):  # one drive is still heard of
+        bench.age_ns[list(silent)] = 60 * MS
+        bench.observe()
+        with pytest.raises(Refused, match="switch the power of the drives off and on first"):
+            bench.supervisor.handle(Event.ACK)
+    bench.age_ns[:] = 60 * MS
+    bench.observe()
+    bench.age_ns[:] = 0
+    bench.observe()
+    assert bench.supervisor.handle(Event.ACK) is State.SILENT
+
+
+def test_the_next_failure_takes_the_power_off_anew():
+    bench = Bench(State.RUN)
+    into_fault(bench, Protection.DRIVE)
+    bench.age_ns[:] = 60 * MS
+    bench.observe()
+    bench.age_ns[:] = 0
+    for event in (Event.ACK, Event.SELFTEST, Event.ARM):
+        bench.supervisor.handle(event)
+    into_fault(bench, Protection.DRIVE)
+    with pytest.raises(Refused, match="switch the power"):
+        bench.supervisor.handle(Event.ACK)
+
+
+def test_a_stop_for_a_failed_drive_that_ends_in_hold_is_acknowledged_like_any_other():
+    supervisor = Bench(State.RUN).supervisor
+    supervisor.trip(a_trip(Category.BRAKE_HOLD, Protection.DRIVE))
+    supervisor.handle(Event.STANDSTILL_HOLD)
+    assert supervisor.handle(Event.ACK) is State.ARMED
+
+
+def test_other_faults_are_acknowledged_with_the_power_on():
+    bench = Bench(State.RUN)
+    into_fault(bench, Protection.TRACKING)
+    assert bench.supervisor.handle(Event.ACK) is State.SILENT
+
+
+# -- the deadman's switch ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("state", PATHS)
+def test_letting_go_of_the_deadmans_switch_stops_what_moves(state):
+    bench = Bench(state)
+    bench.supervisor.deadman.take(Grip.RELEASED, 0)
+    bench.observe()
+    found = [(trip.protection, trip.category) for trip in bench.supervisor.trips]
+    assert found == ([(Protection.DEADMAN, Category.BRAKE_HOLD)] if state in (State.RUN, State.RESET) else [])
+
+
+def test_holding_the_deadmans_switch_again_goes_on_from_standstill_only():
+    bench = Bench(State.RUN)
+    bench.supervisor.deadman.take(Grip.RELEASED, 0)
+    assert bench.observe() is State.STOPPING
+    bench.supervisor.deadman.take(Grip.HELD, bench.now)
+    assert bench.observe() is State.STOPPING
+    bench.observe_until(bench.now + 5 * PERIOD)
+    assert bench.supervisor.state is State.RUN
+    assert bench.supervisor.cause is None
+    # The policy, whose targets went by, has a heartbeat from now on.
+    bench.observe_until(bench.now + 90 * MS)
+    assert bench.supervisor.state is State.RUN
+    bench.observe_until(bench.now + 20 * MS)
+    assert bench.supervisor.cause.protection is Protection.HEARTBEAT
+
+
+def test_a_deadmans_switch_that_is_held_again_does_not_undo_an_operators_stop():
+    bench = Bench(State.RUN)
+    bench.supervisor.deadman.take(Grip.RELEASED, 0)
+    bench.observe()
+    bench.supervisor.handle(Event.STOP)
+    bench.supervisor.deadman.take(Grip.HELD, bench.now)
+    bench.observe_until(100 * MS)
+    assert bench.supervisor.state is State.HOLD
+
+
+def test_a_reset_routine_does_not_go_on_by_itself():
+    bench = Bench(State.RESET)
+    bench.supervisor.deadman.take(Grip.RELEASED, 0)
+    bench.observe()
+    bench.supervisor.deadman.take(Grip.HELD, bench.now)
+    bench.observe_until(100 * MS)
+    assert bench.supervisor.state is State.HOLD
+
+
+# -- what is believed ----------------------------------------------------------------------------------------------
+
+
+def a_sample(stamp_ns, position):
+    return Sample(stamp_ns, position, REST, REST, np.full(7, stamp_ns), enabled=True)
+
+
+@pytest.mark.parametrize("state", PATHS)
+def test_a_jump_is_believed_only_while_the_drives_are_off(state):
+    supervisor = Bench(state).supervisor
+    supervisor.screen(a_sample(0, HOME))
+    jumped = supervisor.screen(a_sample(PERIOD, HOME + 1.0))
+    assert (jumped.position == HOME).all() == (state in ENABLED)
+
+
+def test_arming_begins_with_what_is_measured_then():
+    supervisor = Bench(State.READY).supervisor
+    supervisor.screen(a_sample(0, HOME))
+    supervisor.handle(Event.ARM)
+    assert (supervisor.screen(a_sample(PERIOD, HOME + 1.0)).position == HOME + 1.0).all()
+
+
+def test_measurements_that_keep_jumping_stop_the_arm():
+    bench = Bench(State.RUN)
+    bench.supervisor.screen(a_sample(0, HOME))
+    for number in range(1, SAFETY.rejected_frames + 1):
+        assert bench.observe(number * PERIOD) is State.RUN
+        bench.supervisor.screen(a_sample(number * PERIOD, HOME + 1.0))
+    assert bench.observe() is State.STOPPING
+    assert bench.supervisor.cause.protection is Protection.RECEIVE
+
+
+# -- P14, P17 and P18 in their states ------------------------------------------------------------------------------
+
+
+def test_commands_that_do_not_leave_the_host_stop_the_arm():
+    bench = Bench(State.ARMED)
+    for _ in range(5):
+        assert bench.observe() is State.ARMED
+        bench.supervisor.bus.sent(delivered=False)
+    bench.observe()
+    assert bench.supervisor.cause.protection is Protection.BUS
+
+
+def test_an_arm_that_creeps_away_from_its_hold_is_cut_off():
+    bench = Bench(State.HOLD)
+    bench.observe()
+    bench.position = HOME + SAFETY.standstill_drift + 1e-6
+    assert bench.observe() is State.DISABLED
+    assert bench.supervisor.cause.protection is Protection.TRACKING
+
+
+def test_an_arm_that_is_armed_may_be_led_away():
+    bench = Bench(State.RUN)
+    bench.observe()
+    bench.position = HOME + SAFETY.standstill_drift + 1e-6
+    assert bench.observe() is State.RUN
+
+
+def test_overspeed_is_judged_whatever_was_asked_for():
+    bench = Bench(State.RUN)
+    bench.led = bench.velocity = 1.3 * ROBOT.limits.velocity
+    for _ in range(2):
+        assert bench.observe() is State.RUN
+    assert bench.observe() is State.STOPPING
+    assert (bench.supervisor.cause.protection, bench.supervisor.category) == (Protection.OVERSPEED, Category.BRAKE_OFF)
+
+
+@pytest.mark.parametrize("state", MOVING)
+def test_the_tool_is_slow_during_resets_only(state):
+    bench = Bench(state)
+    bench.observe()
+    bench.tool = CENTRE + np.array([0.0, 0.0, 0.02])  # 0.4 m/s over 50 ms
+    bench.observe(bench.now + 50 * MS)
+    assert [trip.protection for trip in bench.supervisor.trips] == (
+        [Protection.OVERSPEED] if state is State.RESET else []
+    )
+
+
+# -- P20 -----------------------------------------------------------------------------------------------------------
+
+
+class Crowded:
+    """A scene with one pair, whose clearance is the first joint's position."""
+
+    pairs = (("elbow", "table"),)
+    reach = np.eye(1, 7)
+
+    def measure(self, position, pairs):
+        return position[:1]
+
+    def approach(self, position, pairs):
+        return [-np.eye(1, 7)[0] for _ in pairs]
+
+
+@pytest.mark.parametrize("state", MOVING)
+@pytest.mark.parametrize(("recovery", "trips"), [(False, True), (True, False)])
+def test_links_that_are_too_near_stop_the_arm_unless_it_retreats(state, recovery, trips):
+    bench = Bench(state, Crowded())
+    bench.position[0] = SAFETY.proximity_stop + 1e-6
+    bench.supervisor.recovery = recovery
+    assert bench.observe() is state
+    bench.position = bench.position - np.eye(1, 7)[0] * 2e-6
+    bench.observe()
+    found = [(trip.protection, trip.category) for trip in bench.supervisor.trips]
+    assert found == ([(Protection.PROXIMITY, Category.BRAKE_HOLD)] if trips else [])
+
+
+@pytest.mark.parametrize(("spare", "recovers"), [(1e-6, False), (-1e-6, True)])
+def test_arming_with_links_too_near_begins_the_recovery(spare, recovers):
+    supervisor = Bench(State.ARMED, Crowded()).supervisor
+    position = HOME.copy()
+    position[0] = SAFETY.proximity_stop + spare
+    supervisor.begin_recovery_if_outside(a_sample(0, position), CENTRE)
+    assert supervisor.recovery is recovers
