@@ -80,11 +80,11 @@ class Robot:
     def stopping_time_s(self) -> float:
         """Longest time from a stop's trigger to rest: jerk-limited braking from the velocity cap, plus the actuator.
 
-        Braking with jerk j at deceleration a from speed v takes v/a + a/j; the drives' lag settles within five
-        time constants; two servo periods pass between measurement and command.
+        Braking with jerk j at deceleration a from speed v takes v/a + a/j, and a/j more from full acceleration; the
+        drives' lag settles within five time constants; two servo periods pass between measurement and command.
         """
         limits, twin = self.limits, self.profile.twin
-        braking = float((limits.velocity / limits.acceleration + limits.acceleration / limits.jerk).max())
+        braking = float((limits.velocity / limits.acceleration + 2.0 * limits.acceleration / limits.jerk).max())
         return braking + 5.0 * twin.lag_s + twin.delay_s + 2e-9 * self.period_ns
 
 

@@ -50,17 +50,28 @@ def _acknowledge(bench: Bench, trial: Trial) -> None:
     """From HOLD or FAULT to ARMED."""
     held = bench.state is State.HOLD
     text = bench.ask(Verb.ACK)
-    if "lowered" in text:  # an arm without brakes
+    if "lowered" in text:
         bench.run(_LOWERING_S)
-        bench.plant.place(np.array(bench.robot.profile.home))
         text = bench.ask(Verb.ACK)
     if bench.state is State.SILENT:
         text = bench.ask(Verb.SELFTEST)
     if trial.require(not text, f"ACK was refused: {text}") and not held:
         trial.require(bench.state is State.READY, f"ACK led to {bench.state.name}")
+        _hold(bench, held=True)
         text = bench.ask(Verb.ARM)
         trial.require(not text, f"ARM was refused: {text}")
         bench.run(0.05)
+        _hold(bench, held=False)
+
+
+def _hold(bench: Bench, *, held: bool) -> None:
+    """Lift an arm without brakes, and hold it until its drives do."""
+    if bench.robot.profile.brakes:
+        return
+    for axis in range(bench.robot.dof):
+        bench.plant.jam(axis, held)
+    if held:
+        bench.place(np.array(bench.robot.profile.home))
 
 
 def _retreat(bench: Bench, trial: Trial) -> None:

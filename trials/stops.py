@@ -1,7 +1,7 @@
 """Scenarios that end in a stop: plant a fault under a moving arm, and hold what follows against what is promised."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ _WATCH_S = 1.0
 """How long an arm at rest is watched, with its policy still at work, before the operator does something."""
 _DRIFT = 0.02
 """rad; more is a motion."""
+_LONGEST_REST_S = 3.0
 _SLACK_TICKS = 2
 
 Start = Callable[[Bench], None]
@@ -49,9 +50,18 @@ class Expected:
     excused: frozenset[str] = frozenset()
     """Invariants that the fault itself breaks: limits as the judge names them, or `drift`."""
 
+    note: str = ""
+
     def __str__(self) -> str:
         names = " or ".join(f"{name} category {category}" for name, category in self.accepted)
-        return f"{names}, within {1e3 * self.within_s:.0f} ms; cleared {self.clears.value}"
+        return f"{names}, within {1e3 * self.within_s:.0f} ms; cleared {self.clears.value}{self.note}"
+
+    def losing_torque(self, robot: Robot) -> "Expected":
+        """Return the same for a fault that takes the torque away: without brakes the arm falls, whatever is done."""
+        if robot.profile.brakes:
+            return self
+        everything = frozenset({"position", "velocity", "sphere", "drift", "keep_out"})
+        return replace(self, rest_s=np.inf, excused=everything, note="; without brakes the arm falls")
 
     @property
     def accepted(self) -> list[tuple[str, int]]:
@@ -92,7 +102,7 @@ def _stop(bench: Bench, fault: Fault, expected: Expected, trial: Trial) -> None:
     planted = fault(bench)
     final = State.HOLD if (expected.ends or expected.category) is Category.BRAKE_HOLD else State.FAULT
     bench.until(lambda: bench.state is final, expected.within_s + bench.robot.stopping_time_s + 1.0)
-    bench.run(_WATCH_S + (expected.rest_s or 0.0))
+    bench.run(_WATCH_S + min(expected.rest_s or 0.0, _LONGEST_REST_S))
     judge_trip(bench.trips, expected, trial)
     trial.require(bench.state is final, f"ended in {bench.state.name} instead of {final.name}")
     trial.require(planted.showed(), "the fault did not show: it was not there")

@@ -23,6 +23,7 @@ from robotctl.trials.shaping import tolerated_scenario
 from robotctl.trials.stops import Expected, stop_scenario
 
 _UNDELIVERED_TICKS = 5
+_COASTING_REST_S = 0.4
 _FULL_NS = 40_000_000
 _ERROR_BUS_OFF = 0x40
 _ERROR_RESTARTED = 0x100
@@ -145,12 +146,14 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     safety = robot.profile.safety
     on_bus = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF, within_s=_UNDELIVERED_TICKS * period)
     # For as long as nothing leaves, the drives go on as they were told last.
-    coasting = replace(on_bus, excused=frozenset({"sphere", "position"}))
+    coasting = replace(on_bus, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position"}))
     # Drives that hear nothing any more go off by their own watchdogs, with a fault.
-    unheard = replace(on_bus, clears=Clears.POWER)
+    unheard = replace(on_bus, clears=Clears.POWER).losing_torque(robot)
     senseless = Expected(
         protection=Protection.RECEIVE, category=Category.BRAKE_OFF, within_s=safety.rejected_frames * period
     )
+    if backend == "can":  # what is not believed of the drives leaves nothing to damp the arm by
+        senseless = senseless.losing_torque(robot)
     found = [
         refusal_scenario(13, "no watchdog", "a drive has no watchdog", _timeout_of(0.0), ["watchdog"], 3),
         orphan_scenario(13, "loop gone", "the loop is not heard of any more"),
@@ -169,7 +172,7 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         category=Category.BRAKE_OFF,
         within_s=0.5,
         or_else=((Protection.DRIVE, Category.BRAKE_OFF), (Protection.FEEDBACK, Category.BRAKE_OFF)),
-    )
+    ).losing_torque(robot)
     return [
         *found,
         refusal_scenario(

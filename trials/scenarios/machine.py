@@ -7,6 +7,8 @@ from robotctl.trials.faults import Planted
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.stops import Expected, stop_scenario
 
+_COASTING_REST_S = 0.4
+"""Where nobody commanded the drives for a while, they have to be led back first."""
 _LATE = 1.2
 """Servo periods."""
 
@@ -45,6 +47,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
                 protection=Protection.OVERRUN,
                 category=Category.BRAKE_OFF,
                 within_s=1.2 * safety.overrun_s + 2.0 * period,
+                rest_s=_COASTING_REST_S,
             ),
         ),
     ]

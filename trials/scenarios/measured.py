@@ -158,8 +158,9 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         within_s=safety.feedback_fault_s,
         rest_s=_CRASH_REST_S,
         excused=frozenset({"velocity"}),
-    )
+    ).losing_torque(robot)
     silent = Expected(protection=Protection.FEEDBACK, category=Category.BRAKE_OFF, within_s=safety.feedback_fault_s)
+    silent = silent.losing_torque(robot)
     led_away = Expected(
         protection=Protection.TRACKING,
         category=Category.BRAKE_OFF,
@@ -204,6 +205,8 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
             _kicked(2.0),
             replace(overspeed, category=Category.CUT),
         ),
-        stop_scenario(24, "drive fault", "a drive reports over-current and goes off", _failed, failure),
+        stop_scenario(
+            24, "drive fault", "a drive reports over-current and goes off", _failed, failure.losing_torque(robot)
+        ),
         stop_scenario(24, "too hot", "a drive is at 95 degrees", lambda b: hot(b, _some(b), 95.0), failure),
     ]
