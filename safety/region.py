@@ -31,7 +31,7 @@ class Row(NamedTuple):
 
     @staticmethod
     def keeping(room: float, gain: float, normal: Vector) -> "Row":
-        """Return the row that lets room shrink by `gain` times itself, m/s, or asks for its return where it is negative.
+        """Return the row that lets room shrink by `gain` times itself, m/s, or asks for it back where it is negative.
 
         Args:
             normal: how fast room shrinks with each joint (n,), m/rad.
