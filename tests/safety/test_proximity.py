@@ -8,10 +8,12 @@ from robotctl.control.kinematics import Kinematics
 from robotctl.control.limiter import VelocityLimiter
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Sample
+from robotctl.safety.machine import Event, State
 from robotctl.safety.proximity import Clearances, NothingNear, ProximityBreach, ProximityLimit
 from robotctl.safety.region import Row, regions
 from robotctl.safety.routines import Retreat
 from robotctl.safety.shaper import Clip, Shaper
+from robotctl.safety.supervisor import Supervisor
 from robotctl.safety.trip import Category, Protection
 
 STAMP = 7_000_000
@@ -211,6 +213,60 @@ def test_a_measured_pose_that_is_no_number_is_never_fine() -> None:
     assert ProximityBreach(load_robot("panda"), Lines()).check(np.array([np.nan, 0.0]), STAMP) is not None
 
 
+# -- supervisor -----------------------------------------------------------------------------------------------------
+
+
+class FirstJoint:
+    """One pair, as far apart as the first of seven joints says."""
+
+    pairs = (("hand", "base"),)
+    reach = np.eye(1, 7)
+
+    def measure(self, position, pairs):
+        return np.full(len(pairs), position[0])
+
+
+class Watched:
+    """A supervisor in some state, and what it finds."""
+
+    def __init__(self, state: State) -> None:
+        self.supervisor = Supervisor(load_robot("panda"), FirstJoint())
+        for event in (Event.CONNECT, Event.SELFTEST, Event.ARM):
+            self.supervisor.handle(event)
+        if state is not State.ARMED:
+            self.supervisor.handle(Event.START if state is State.RUN else Event.RESET)
+
+    def observe(self, clearance: float) -> list[tuple[Protection, Category]]:
+        home = np.array(load_robot("panda").profile.home)
+        home[0] = clearance
+        at_centre = np.array(load_robot("panda").profile.sphere.centre)
+        self.supervisor.admission.renew(0)
+        self.supervisor.observe(sample(home, np.zeros(7)), at_centre, home, np.zeros(7), 0)
+        return [(trip.protection, trip.category) for trip in self.supervisor.trips]
+
+
+@pytest.mark.parametrize("state", [State.ARMED, State.RUN, State.RESET])
+def test_the_supervisor_stops_the_arm(state: State) -> None:
+    assert Watched(state).observe(0.0051) == []
+    assert Watched(state).observe(0.0049) == [(Protection.PROXIMITY, Category.BRAKE_HOLD)]
+
+
+def test_a_retreat_is_not_stopped_for_what_it_retreats_from() -> None:
+    watched = Watched(State.RESET)
+    watched.supervisor.recovery = True
+    assert watched.observe(0.001) == []
+
+
+@pytest.mark.parametrize(("clearance", "recovers"), [(0.0051, False), (0.0049, True)])
+def test_armed_too_near_the_arm_may_only_retreat(clearance: float, recovers: bool) -> None:
+    watched = Watched(State.ARMED)
+    home = np.array(load_robot("panda").profile.home)
+    home[0] = clearance
+    tool = np.array(load_robot("panda").profile.sphere.centre)
+    watched.supervisor.begin_recovery_if_outside(sample(home, np.zeros(7)), tool)
+    assert watched.supervisor.recovery is recovers
+
+
 # -- robots ---------------------------------------------------------------------------------------------------------
 
 
@@ -279,7 +335,7 @@ def test_hostile_wishes_bring_no_pair_too_near(robot: Robot, policy: str, around
 
 @pytest.mark.parametrize("watched", [True, False])
 def test_an_elbow_is_kept_out_where_the_tool_is_far_away(watched: bool) -> None:
-    """The elbow swings about the line from shoulder to tool, against a beam at its side; the tool stays put."""
+    """The elbow swings about the line from shoulder to tool, against a beam at its side; the tool stays."""
     beam = "{kind: box, name: beam, centre: [-0.05, 0.28, 0.6], half: [0.3, 0.02, 0.02]}"
     robot = load_robot("panda", [f"keep_out=[{beam}]"])
     scene = CollisionModel(robot, Kinematics(robot))
