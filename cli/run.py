@@ -17,16 +17,17 @@ from robotctl.cli.errors import Exit, hear_interrupts, readable_errors
 from robotctl.cli.keys import stop_keys
 from robotctl.cli.output import write_json
 from robotctl.control.acknowledgement import acknowledge, require_acknowledged
+from robotctl.control.kinematics import Kinematics
 from robotctl.control.operator import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.recording_session import SessionRecording, record_session
 from robotctl.control.session import LockstepSession, Session
 from robotctl.hal.can.channel import may_be_real
-from robotctl.hal.errors import ConfigError, HardwareError
+from robotctl.hal.errors import HardwareError
 from robotctl.hal.profile import CLASSIC_HZ
 from robotctl.hal.robot import load_robot
 from robotctl.learning.actor import Actor, InlineActor, ProcessActor
-from robotctl.learning.policies import POLICIES
+from robotctl.learning.policies import POLICIES, make_policy
 from robotctl.learning.run import Episode, Outcome, report, run_episodes
 from robotctl.learning.task import ReachTask, load_task
 
@@ -39,7 +40,9 @@ def run(
     backend: Annotated[str, typer.Option(help="sim: the MuJoCo twin. can: drives on a CAN bus.")] = "sim",
     robot: Annotated[str, typer.Option(help="Name of a shipped robot, or path of a profile.")] = "panda",
     task: Annotated[str, typer.Option(help="Name of a shipped task, or path of a task file.")] = "reach",
-    policy: Annotated[str, typer.Option(help=f"One of {', '.join(POLICIES)}.")] = "scripted",
+    policy: Annotated[
+        str, typer.Option(help=f"One of {', '.join(POLICIES)}, or the path of a network (.npz).")
+    ] = "scripted",
     channel: Annotated[str, typer.Option(help="CAN only: emulated, virtual:NAME, socketcan:can0, slcan:DEVICE.")] = "",
     episodes: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the targets and of random policies.")] = 0,
@@ -66,8 +69,7 @@ def run(
             model = load_robot(robot, overrides)
             console.print(f"slcan carries classic CAN only: servo rate {CLASSIC_HZ} Hz")
         work = load_task(task)
-        if policy not in POLICIES:
-            raise ConfigError(f"unknown policy {policy!r}", f"use one of {', '.join(POLICIES)}")
+        make_policy(policy, model, Kinematics(model), seed)  # complains here rather than in its process
         session: Session
         actor: Actor
         if fast:
@@ -155,6 +157,9 @@ def _attempt(job: Job, outcome: Outcome, console: Console) -> Exit:
     """Run the episodes until they are done, or safety, a person or a signal ends them; the arm is at rest then."""
 
     def on_episode(index: int, episode: Episode) -> None:
+        if episode.refused:
+            console.print(f"  episode {index + 1}  refused  P26: {episode.refused}", style="yellow", markup=False)
+            return
         mark = "[green]reached[/]" if episode.success else "[yellow]missed[/] "
         distance = f"{1e3 * episode.final_distance_m:7.1f} mm"
         console.print(f"  episode {index + 1}  {mark}  {distance}  {episode.steps:4d} steps")

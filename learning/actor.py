@@ -15,13 +15,14 @@ from typing import Self
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.session import LockstepSession
-from robotctl.hal.errors import HardwareError
+from robotctl.hal.errors import ConfigError, HardwareError
 from robotctl.hal.types import Vector
 from robotctl.learning.policies import Die, Stall, make_policy
 from robotctl.learning.policy_process import VALID_PERIODS, PolicyConfig, target_of
 from robotctl.learning.task import ReachTask
 
 _START_TIMEOUT_S = 30.0
+_BEGIN_TIMEOUT_S = 2.0
 
 
 class Actor(ABC):
@@ -32,8 +33,8 @@ class Actor(ABC):
         """Get ready to act."""
 
     @abstractmethod
-    def begin(self, goal: Vector) -> None:
-        """Begin an episode towards `goal` (3,), m."""
+    def begin(self, goal: Vector) -> str:
+        """Begin an episode towards `goal` (3,), m. Returns why it must not take place; empty if it has begun."""
 
     @abstractmethod
     def step(self) -> None:
@@ -86,9 +87,11 @@ class InlineActor(Actor):
     def start(self) -> None:
         """Nothing to start."""
 
-    def begin(self, goal: Vector) -> None:
-        self._goal = goal
+    def begin(self, goal: Vector) -> str:
+        refusal = self._policy.begin()
+        self._goal = None if refusal else goal
         self._step = 0
+        return refusal
 
     def step(self) -> None:
         if self._goal is None or self._ended:
@@ -158,10 +161,12 @@ class ProcessActor(Actor):
             )
         finally:
             os.close(view)
-        self._await_ready(self._process)
+        self._await_ready()
 
-    def begin(self, goal: Vector) -> None:
+    def begin(self, goal: Vector) -> str:
         self._tell({"goal": [float(value) for value in goal]})
+        # One that does not answer is not waited for: the supervisor misses its heartbeat.
+        return str(self._answer(_BEGIN_TIMEOUT_S).get("refused", ""))
 
     def step(self) -> None:
         """It keeps its own time."""
@@ -202,12 +207,20 @@ class ProcessActor(Actor):
             self._process.stdin.write(json.dumps(request) + "\n")
             self._process.stdin.flush()
 
-    def _await_ready(self, process: subprocess.Popen[str]) -> None:
-        deadline = time.monotonic() + _START_TIMEOUT_S
-        while time.monotonic() < deadline and process.stdout is not None:
+    def _await_ready(self) -> None:
+        words = self._answer(_START_TIMEOUT_S)
+        if "error" in words:
+            raise ConfigError(str(words["error"]))
+        if not words:
+            raise HardwareError("the policy process did not come up", "run it with --fast to see its error")
+
+    def _answer(self, timeout_s: float) -> dict[str, object]:
+        """Return the next thing that the policy process says; nothing if it does not within the time."""
+        process = self._process
+        deadline = time.monotonic() + timeout_s
+        while process is not None and process.stdout is not None and time.monotonic() < deadline:
             self._session.advance(0.0)
-            if select.select([process.stdout], [], [], 0.05)[0] and process.stdout.readline():
-                return
-            if process.poll() is not None:
-                break
-        raise HardwareError("the policy process did not come up", "run it with --fast to see its error")
+            if select.select([process.stdout], [], [], 0.05)[0]:
+                line = process.stdout.readline()
+                return json.loads(line) if line else {}
+        return {}

@@ -1,12 +1,7 @@
-"""Policies: the scripted one that solves `reach`, and hostile ones that try to break the arm.
+"""Policies by name: the scripted one that solves `reach`, hostile ones that try to break the arm, and networks."""
 
-A policy maps an observation to joint velocities, 20 times a second. Whatever it returns is wrapped in a target and
-admitted, or not, by the supervisor.
-"""
-
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 
@@ -14,22 +9,8 @@ from robotctl.control.kinematics import Kinematics
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
-
-
-class Observation(NamedTuple):
-    """What a policy sees."""
-
-    position: Vector
-    """Measured joints (n,), rad."""
-    velocity: Vector
-    """(n,), rad/s"""
-    tool: Vector
-    """Measured tool point (3,), m."""
-    goal: Vector
-    """Target point (3,), m."""
-    step: int
-    """Policy steps since the episode began."""
-
+from robotctl.learning.network import NetworkPolicy
+from robotctl.learning.policy import Observation, Policy
 
 _BEHAVES = 10
 """Policy steps for which the treacherous ones behave."""
@@ -41,14 +22,6 @@ class Stall(Exception):  # noqa: N818 - a behaviour, not an error
 
 class Die(Exception):  # noqa: N818
     """The policy's process ends on the spot."""
-
-
-class Policy(ABC):
-    """Joint velocities from observations."""
-
-    @abstractmethod
-    def act(self, observation: Observation) -> Vector:
-        """Return the wanted joint velocities (n,), rad/s."""
 
 
 class Scripted(Policy):
@@ -157,12 +130,14 @@ POLICIES: dict[str, Callable[[Robot, Kinematics, int], Policy]] = {
 
 
 def make_policy(name: str, robot: Robot, kinematics: Kinematics, seed: int = 0) -> Policy:
-    """Return a policy by name.
+    """Return a policy by its name, or by the path of a network (`.npz`).
 
     Raises:
-        ConfigError: if there is no such policy.
+        ConfigError: if there is no such policy, or the network is refused.
     """
+    if name.endswith(".npz"):
+        return NetworkPolicy(robot, Path(name))
     factory = POLICIES.get(name)
     if factory is None:
-        raise ConfigError(f"unknown policy {name!r}", f"use one of {', '.join(POLICIES)}")
+        raise ConfigError(f"unknown policy {name!r}", f"use one of {', '.join(POLICIES)}, or the path of a .npz file")
     return factory(robot, kinematics, seed)

@@ -2,7 +2,8 @@
 
 It sends a target in every period, `Hold` while no episode runs, so that its silence always means something. Between
 episodes it reads one JSON line from stdin per request: `{"goal": [x, y, z]}` begins an episode, `{"rest": true}`
-ends it. It answers `{"ready": true}` once it can act.
+ends it. It says `{"ready": true}` once it can act, or what the `error` is, and answers every goal with why it is
+`refused`, empty if it is not.
 """
 
 import json
@@ -19,9 +20,11 @@ import numpy as np
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.process_tools import name_process, signal_on_parent_death
 from robotctl.control.shared import Link
+from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import load_robot
 from robotctl.hal.types import Vector
-from robotctl.learning.policies import Die, Observation, Policy, Stall, make_policy
+from robotctl.learning.policies import Die, Stall, make_policy
+from robotctl.learning.policy import Observation, Policy
 from robotctl.safety.machine import State
 from robotctl.safety.target import Hold, JointVelocity, Target
 
@@ -61,18 +64,25 @@ def main(text: str) -> int:
     signal_on_parent_death(signal.SIGKILL, config.operator)
     robot = load_robot(config.robot, config.overrides)
     link = Link.attach(config.mailbox_fd, config.board_fd, robot.dof, config.slots, read_only=True)
-    policy = make_policy(config.policy, robot, Kinematics(robot), config.seed)
+    try:
+        policy = make_policy(config.policy, robot, Kinematics(robot), config.seed)
+    except ConfigError as error:
+        _say({"error": error.what})
+        return 2
     period_ns = round(1e9 / config.policy_hz)
     goal: Vector | None = None
     step = seq = 0
-    print(json.dumps({"ready": True}), flush=True)  # noqa: T201 - the protocol of this process
+    _say({"ready": True})
     deadline = time.monotonic_ns()
     while True:
         for request in _requests(deadline):
             if request is None:
                 return 0
-            goal = np.array(request["goal"]) if "goal" in request else None
-            step = 0
+            goal, step = None, 0
+            if "goal" in request:
+                refused = policy.begin()
+                goal = None if refused else np.array(request["goal"])
+                _say({"refused": refused})
         record = link.ticks.latest()
         if record is not None:
             expires = time.monotonic_ns() + VALID_PERIODS * period_ns
@@ -88,6 +98,10 @@ def main(text: str) -> int:
             link.mailbox.put(target)
             seq += 1
         deadline = max(deadline + period_ns, time.monotonic_ns())
+
+
+def _say(words: dict[str, object]) -> None:
+    print(json.dumps(words), flush=True)  # noqa: T201 - the protocol of this process
 
 
 def _requests(deadline_ns: int) -> list[dict[str, Any] | None]:

@@ -15,6 +15,7 @@ from robotctl.hal.types import Vector
 from robotctl.learning.actor import Actor
 from robotctl.learning.task import ReachTask
 from robotctl.safety.machine import State
+from robotctl.safety.trip import Protection
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,8 @@ class Episode:
     success: bool
     final_distance_m: float
     steps: int
+    refused: str = ""
+    """Why it did not take place: what the policy was to be exchanged for was refused (P26)."""
 
 
 @dataclass(slots=True)
@@ -64,6 +67,8 @@ def run_episodes(
             episode = _run_episode(session, actor, task, goal, rate)
             outcome.episodes.append(episode)
             on_episode(index, episode)
+            if episode.refused:
+                continue
             if session.state is not State.RUN:
                 raise Stopped(_reason(session, actor))
             session.end()
@@ -80,7 +85,9 @@ def run_episodes(
 
 def _run_episode(session: Session, actor: Actor, task: ReachTask, goal: Vector, rate: "_RateMeter") -> Episode:
     period = 1.0 / task.policy_hz
-    actor.begin(goal)
+    refused = actor.begin(goal)
+    if refused:
+        return Episode(False, _distance(session, goal), 0, refused)
     session.begin()
     settled = step = 0
     distance = math.inf
@@ -89,16 +96,20 @@ def _run_episode(session: Session, actor: Actor, task: ReachTask, goal: Vector, 
         session.advance(period)
         if step == 2:  # the policy has seen the start by now
             rate.begin(session)
-        record = session.latest()
-        tool = record["true_tool"] if record["has_truth"] else record["tool"]
-        distance = float(np.linalg.norm(tool - goal))
+        distance = _distance(session, goal)
         settled = settled + 1 if distance < task.settled else 0
         # HOLD and STOPPING may still clear, if a heartbeat comes back in time.
-        if settled >= task.settled_steps or not _may_continue(session, State(int(record["state"]))):
+        if settled >= task.settled_steps or not _may_continue(session, session.state):
             break
     rate.end(session)
     actor.rest()
     return Episode(distance <= task.success and session.state is State.RUN, distance, step)
+
+
+def _distance(session: Session, goal: Vector) -> float:
+    record = session.latest()
+    tool = record["true_tool"] if record["has_truth"] else record["tool"]
+    return float(np.linalg.norm(tool - goal))
 
 
 def _may_continue(session: Session, state: State) -> bool:
@@ -167,6 +178,9 @@ def report(session: Session, outcome: Outcome, about: dict[str, Any], recording:
                 for trip in session.trips
             ],
             "pages": session.pages,
+            "refused": [
+                {"protection": Protection.WEIGHTS.label, "cause": e.refused} for e in outcome.episodes if e.refused
+            ],
             "violations": session.judge.violations,
             "worst_excess": {
                 key: round(value, 6) for key, value in session.judge.worst.items() if math.isfinite(value)

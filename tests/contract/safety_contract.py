@@ -12,7 +12,8 @@ from robotctl.control.operator import Verb
 from robotctl.control.session import LockstepSession, Stopped
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Vector
-from robotctl.learning.policies import Observation, make_policy
+from robotctl.learning.policies import make_policy
+from robotctl.learning.policy import Observation
 from robotctl.safety.deadman import Grip
 from robotctl.safety.machine import State
 from robotctl.safety.target import JointTorque, JointVelocity, Target

@@ -6,7 +6,8 @@ import pytest
 from robotctl.control.kinematics import Kinematics
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
-from robotctl.learning.policies import POLICIES, Die, Observation, Stall, make_policy
+from robotctl.learning.policies import POLICIES, Die, Stall, make_policy
+from robotctl.learning.policy import Observation
 
 
 @pytest.fixture
