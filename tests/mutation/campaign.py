@@ -3,8 +3,8 @@
 The mutated module is compiled from its changed tree when the fork imports it, before any test does, so a change
 counts everywhere: in constants that others import, in tables, in base classes. The fork runs the tests that execute
 a changed line, the module's own and the fastest first, and ends at the first that fails. The lines that a test
-executes are found out once, in a survey that runs all tests on the unchanged modules. Time limits are in processor time, so that a busy
-machine kills nothing; a fork that runs out of it, or crashes, counts as killed.
+executes are found out once, in a survey that runs all tests on the unchanged modules. Time limits are in processor
+time, so that a busy machine kills nothing; a fork that runs out of it, or crashes, counts as killed.
 
 mutmut 3.8 is as fast (6 minutes for 1,200 mutants on two cores), but it changes nothing outside functions. The
 state table, the gains and the thresholds of `safety/` stand there; and most of its survivors are texts for people.
@@ -206,14 +206,18 @@ def _run_tests(package: Package, case: Case | None, tests: dict[str, float]) -> 
         case.mutant.apply()
         _import_from_trees(package, {case.file: package.trees[case.file]})
         own = f"test_{case.file.removesuffix('.py')}"
-    first = {test: seconds for test, seconds in tests.items() if Path(test).name.startswith(own)}
+    first = {test: seconds for test, seconds in tests.items() if Path(_file(test)).name.startswith(own)}
     code = 0
     for part in (first, {test: seconds for test, seconds in tests.items() if test not in first}):
         if part and not code:
-            files = sorted({test.split("::")[0] for test in part})
+            files = sorted({_file(test) for test in part})
             signal.setitimer(signal.ITIMER_PROF, 10.0 * _ALLOWANCE_S)
             code = _pytest(package, [str(package.root / file) for file in files], _Selection(part))
     return code
+
+
+def _file(test: str) -> str:
+    return test.split("::")[0]
 
 
 def _run_survey(package: Package, answer: Path) -> int:
