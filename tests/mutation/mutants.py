@@ -17,8 +17,8 @@ A tie is moved only between integers: nanoseconds, counters, enumerations. A tie
 occurs, and what a limit does one rounding error further on is no promise of ours. Which operands are integers is
 not guessed from names but seen while the tests run (`watch`).
 
-Left alone is what means nothing at run time, or is there for people: annotations, strings, what is raised, abstract
-methods, protocols, and the numbers of enumerations.
+Left alone is what means nothing at run time, or is there for people: annotations, strings, what is raised, `strict` of
+zip, abstract methods, protocols, and the numbers of enumerations.
 """
 
 import ast
@@ -143,6 +143,8 @@ def _left_alone(node: ast.AST, owner: ast.AST, field: str) -> bool:
             return True
         case ast.ClassDef(bases=bases):
             return any(_name(base) == "Protocol" for base in bases)
+        case ast.keyword(arg="strict"):  # of zip: an assertion
+            return True
         case ast.FunctionDef(decorator_list=decorators):
             return any(_name(decorator) == "abstractmethod" for decorator in decorators)
         case ast.Assign(targets=targets) if isinstance(owner, ast.ClassDef):

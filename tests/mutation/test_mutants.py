@@ -84,6 +84,7 @@ def test_operators_in_functions(body, expected):
         "def f(a: int | None) -> int | None: ...",
         "a: tuple[int, float]",
         "def f(): raise E(1 + 2 < 3)",
+        "def f():\n for a in zip(b, strict=True): ...",
         "class A(IntEnum):\n B = 1\n C = -2",
         "class A:\n __slots__ = ('a', 'b')",
         "class A(Protocol):\n def f(self):\n  return 1 + 2",

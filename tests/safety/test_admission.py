@@ -145,9 +145,10 @@ def test_a_new_policy_begins_with_any_sequence_number(admission: Admission) -> N
     assert admission.fresh(5 * MS) is None
     assert admission.heartbeat(105 * MS - 1) is None
     assert admission.heartbeat(105 * MS) is not None
+    admission.offer(velocity(seq=-1), 0, 5 * MS)
+    assert admission.refused == 1
     admission.offer(velocity(seq=0), 0, 5 * MS)
     assert admission.seq == 0
-    assert admission.refused == 0
 
 
 def test_the_first_sequence_number_is_0(admission: Admission) -> None:

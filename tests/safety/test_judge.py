@@ -66,8 +66,9 @@ def test_each_planted_violation_is_counted_once(key):
 
 
 def test_keep_outs_count_where_there_are_any():
-    table = "keep_out=[{kind: plane, name: table, point: [0, 0, 0.3], normal: [0, 0, 1], clearance: 0.01}]"
-    judge = Judge(load_robot("panda", [table]))
+    table = "{kind: plane, name: table, point: [0, 0, 0.3], normal: [0, 0, 1], clearance: 0.01}"
+    far = "{kind: plane, name: wall, point: [-9, 0, 0], normal: [1, 0, 0]}"
+    judge = Judge(load_robot("panda", [f"keep_out=[{table}, {far}]"]))
     records = clean(4)
     for index, excess in ((1, REGION_BOUND + 1e-6), (2, REGION_BOUND - 1e-6)):
         records["true_tool"][index] = CENTRE * [1, 1, 0] + [0.0, 0.0, 0.31 - excess]

@@ -111,6 +111,22 @@ def test_feedback_age(panda: Robot, joint):
             assert f"{panda.profile.joints[joint].name} has not answered for 50 ms" in trip.cause
 
 
+def test_before_the_first_sample_nothing_is_missed(panda: Robot):
+    check = FeedbackAge(panda)
+    assert (check.stale, check.lost, check.dead) == (False, False, False)
+
+
+@pytest.mark.parametrize(("later", "dead"), [(0, False), (1, True)])
+def test_drives_are_dead_when_the_last_one_has_been_silent_for_too_long(panda: Robot, later, dead):
+    check = FeedbackAge(panda)
+    now = 10**9
+    stamps = np.full(7, 0)
+    stamps[4] = now - round(panda.profile.safety.feedback_fault_s * 1e9) - later
+    check.check(sample(np.zeros(7), stamps=stamps), now)
+    assert check.lost
+    assert check.dead is dead
+
+
 @pytest.mark.parametrize("key", ["position_breach", "sphere_breach"])
 def test_thresholds_come_from_the_profile(key):
     """At a distance of 0.4 both trip by default, and none with a threshold of 0.5."""

@@ -257,6 +257,12 @@ def test_a_retreat_that_knows_no_way_stays_where_it_is(panda: Robot):
     assert not Retreat(panda, Slide(above)).velocity(sample(position), position).any()
 
 
+def test_in_the_very_middle_of_a_tiny_sphere_every_way_leads_out():
+    robot = load_robot("panda", ["sphere.radius=0.005"])
+    position = np.array(robot.profile.home)
+    assert not Retreat(robot, Slide(SPHERE.centre)).velocity(sample(position), position).any()
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize(("error", "speed"), [(0.01, 0.03), (0.5, 0.3)])
 def test_goto_slows_down_in_proportion_and_keeps_to_its_share_of_the_caps(panda: Robot, side, error, speed):

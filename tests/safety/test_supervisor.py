@@ -138,6 +138,23 @@ def test_an_operators_softer_stop_does_not_soften_a_hard_one():
     assert supervisor.category is Category.BRAKE_OFF
 
 
+def test_a_stop_that_ended_cleanly_leaves_nothing_behind():
+    supervisor = Bench(State.RUN).supervisor
+    for event in (Event.DISARM, Event.STANDSTILL_OFF):
+        supervisor.handle(event)
+    before = supervisor.epoch
+    supervisor.handle(Event.OFF_CLEAN)
+    assert (supervisor.state, supervisor.category, supervisor.epoch) == (State.READY, None, before + 1)
+
+
+def test_acknowledging_clears_the_cause():
+    supervisor = Bench(State.RUN).supervisor
+    supervisor.trip(a_trip(Category.BRAKE_HOLD))
+    supervisor.handle(Event.STANDSTILL_HOLD)
+    supervisor.handle(Event.ACK)
+    assert (supervisor.category, supervisor.cause) == (None, None)
+
+
 # -- epochs --------------------------------------------------------------------------------------------------------
 
 
@@ -158,6 +175,10 @@ def test_every_stop_and_every_entry_into_armed_raises_the_epoch(state, event):
     before = supervisor.epoch
     supervisor.handle(event)
     assert supervisor.epoch == before + 1
+
+
+def test_the_first_epoch_is_0():
+    assert Supervisor(ROBOT).epoch == 0
 
 
 def test_starting_keeps_the_epoch_so_that_a_policy_may_be_ready_first():
@@ -330,6 +351,17 @@ def test_standstill_takes_five_quiet_ticks_in_a_row():
         assert state is (State.HOLD if quiet == 5 else State.STOPPING)
 
 
+def test_the_quiet_ticks_are_counted_anew_for_every_stop():
+    bench = Bench(State.STOPPING)
+    for _ in range(5):
+        bench.observe()
+    for event in (Event.ACK, Event.START, Event.STOP):
+        bench.supervisor.handle(event)
+    for _ in range(4):
+        assert bench.observe() is State.STOPPING
+    assert bench.observe() is State.HOLD
+
+
 def test_one_joint_that_moves_is_not_standstill():
     bench = Bench(State.STOPPING)
     bench.velocity[6] = -SAFETY.standstill
@@ -357,9 +389,8 @@ def test_a_stop_that_never_comes_to_rest_ends_anyway(category, state):
     limit = round((ROBOT.stopping_time_s + 0.5) * 1e9)
     bench.observe()
     began = bench.now
-    bench.observe_until(began + limit)
-    assert bench.supervisor.state is State.STOPPING
-    assert bench.observe() is state
+    assert bench.observe(began + limit) is State.STOPPING
+    assert bench.observe(began + limit + 1) is state
 
 
 def test_the_time_a_stop_may_take_begins_anew_with_the_next_stop():
@@ -403,6 +434,13 @@ def test_a_heartbeat_back_within_the_grace_resumes_with_new_targets_only():
     assert bench.supervisor.category is None
     assert bench.supervisor.admitted(bench.now) is not None
     assert len(bench.supervisor.trips) == 1
+
+
+def test_a_heartbeat_that_is_back_while_the_arm_still_brakes_resumes_at_once():
+    bench = silent_run()
+    bench.velocity[:] = 0.5
+    bench.offer()
+    assert bench.observe() is State.RUN
 
 
 @pytest.mark.parametrize(("at_ms", "resumes"), [(600, True), (602, False), (2000, False)])
@@ -691,6 +729,15 @@ def test_holding_the_deadmans_switch_again_goes_on_from_standstill_only():
     assert bench.supervisor.state is State.RUN
     bench.observe_until(bench.now + 20 * MS)
     assert bench.supervisor.cause.protection is Protection.HEARTBEAT
+
+
+def test_as_long_as_the_deadmans_switch_is_let_go_the_arm_stays_at_rest():
+    bench = Bench(State.RUN)
+    bench.supervisor.deadman.take(Grip.RELEASED, 0)
+    bench.observe_until(20 * MS)
+    for _ in range(10):
+        assert bench.observe() is State.HOLD
+    assert len(bench.supervisor.trips) == 1
 
 
 def test_a_deadmans_switch_that_is_held_again_does_not_undo_an_operators_stop():
