@@ -77,7 +77,7 @@ class Powering:
                 self.lower(now_ns)
             elif self.damping:
                 supervisor.handle(Event.OFF_FAULT)
-        if self.damping and sample.enabled and not supervisor.feedback.lost:
+        if self.damping and sample.enabled and not supervisor.feedback.lost and not supervisor.runs_away:
             share = 1.0 if self._lowering_ns is None else gravity_share(self._lowering_ns, now_ns)
             if share > 0.0:
                 self._arm.write(self._motion.damp(sample.position, share))

@@ -27,6 +27,8 @@ _TRIP_EVENTS = {
 _RECOVERABLE = (Protection.POSITION, Protection.SPHERE, Protection.PROXIMITY)
 """After these, acknowledging permits nothing but the retreat."""
 _STANDSTILL_TICKS = 5
+_RUNAWAY_NS = 100_000_000
+"""Longest time for which a damped joint may be too fast."""
 _STOP_ALLOWANCE_S = 0.5
 
 
@@ -66,6 +68,9 @@ class Supervisor:
         self._settled = 0
         self._was_running = False
         self._power_cycled = False
+        self._fast_since_ns = 0
+        self.runs_away = False
+        """Whether a joint goes on too fast although it should have been stopped: damping does not help."""
 
     # -- what happens to it ---------------------------------------------------------------------------------------
 
@@ -151,6 +156,10 @@ class Supervisor:
         silent = self.feedback.check(sample, now_ns)  # in every state: an arm is damped with the drives on, too
         if self.feedback.dead:
             self._power_cycled = True
+        fast = self._overspeed.check(sample)
+        if fast is None:
+            self._fast_since_ns = now_ns
+        self.runs_away = now_ns - self._fast_since_ns > _RUNAWAY_NS
         if self.state not in ENABLED:
             return
         trips = [
@@ -160,7 +169,7 @@ class Supervisor:
             self.drives.check(sample),
             self._tracking.check(sample, position, velocity),
             self._drift.check(sample, holding=self.state is State.HOLD),
-            self._overspeed.check(sample),
+            fast,
             self._tool_speed.check(tool, sample.stamp_ns, slow=self.state is State.RESET),
         ]
         if not self.recovery:

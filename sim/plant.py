@@ -21,6 +21,8 @@ WATCHDOG_SHARE = 0.8
 """Watchdog timeout of simulated drives, as a fraction of the longest that the profile allows."""
 _BRAKE_TORQUE = 500.0
 """Nm of dry friction that a closed brake adds."""
+_BRAKE_ARMATURE = 0.1
+"""Least inertia of a joint whose brake is closed, kg m^2."""
 _BRAKE_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Impedance of that friction; see MuJoCo's solver parameters."""
 
@@ -59,6 +61,8 @@ class Plant:
         self._tool_site = self.model.site("robotctl_tool").id
         self._friction = self.model.dof_frictionloss.copy()
         self._solimp = self.model.dof_solimp.copy()
+        self._armature = self.model.dof_armature.copy()
+        self._weight = self.model.dof_invweight0.copy()
         self._jammed = [False] * self.axes
         # Until its drives come on, an arm lies in its cradle.
         self._braked = [axis < self.dof for axis in range(self.axes)]
@@ -174,6 +178,10 @@ class Plant:
         self.model.dof_frictionloss[dof] = _BRAKE_TORQUE if held else self._friction[dof]
         # MuJoCo's dry friction creeps: as it comes, a braked joint slides at 1 mrad/s per rad/s^2 that it keeps back.
         self.model.dof_solimp[dof] = _BRAKE_SOLIMP if held else self._solimp[dof]
+        # Nor does it hold a joint that weighs next to nothing, as the last ones of an arm may.
+        armature, weight = self._armature[dof], self._weight[dof]
+        self.model.dof_armature[dof] = max(armature, _BRAKE_ARMATURE) if held else armature
+        self.model.dof_invweight0[dof] = min(weight, 1.0 / _BRAKE_ARMATURE) if held else weight
 
 
 def _build(robot: Robot) -> tuple[mujoco.MjModel, list[int]]:

@@ -248,6 +248,10 @@ class Weak(Trouble):
         kp, kd = (gain[axis] for gain in self._arm.gains)
         if command.mode is not CommandMode.TRACK:
             kp, kd = 0.0, kd if command.mode is CommandMode.DAMP else 0.0
+        position, effort = command.position[axis], command.effort[axis]
         velocity = command.velocity[axis] if command.mode is CommandMode.TRACK else 0.0
-        effort = command.effort[axis]
-        self._arm.plant.drive(axis, part * kp, part * kd, command.position[axis], velocity, part * effort)
+        if part < 0.0:  # MuJoCo's implicit step takes no negative damping
+            state = self._arm.plant.axis(axis)
+            effort += kp * (position - state.position) + kd * (velocity - state.velocity)
+            kp = kd = 0.0
+        self._arm.plant.drive(axis, part * kp, part * kd, position, velocity, part * effort)

@@ -12,12 +12,15 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
 from robotctl.safety.target import JointTorque, JointVelocity, Target
 from robotctl.trials.bench import Bench, Policy
+from robotctl.trials.poses import at_limit
 
 Act = Callable[[float, Vector], Vector]
 """Takes the time, s, and the measured joints (n,), rad; returns an action (n,)."""
 
 EXCESS = 2.0
 """Multiple of the velocity caps that a hostile action of 1 asks for."""
+_RUN_UP = 0.4
+"""rad"""
 _TORQUE_SHARE = 0.6
 """Part of the torque caps that an action of 1 asks for, on top of gravity."""
 
@@ -85,7 +88,14 @@ def outward(robot: Robot, rng: np.random.Generator) -> Act:
     return act
 
 
-def against_limits(robot: Robot, rng: np.random.Generator) -> Act:
-    """Every joint towards one of its limits for ever; towards the other one from time to time."""
-    sign = rng.choice([-1.0, 1.0], robot.dof)
-    return lambda time, _: sign if int(time / 4.0) % 2 == 0 else -sign
+def before_limit(bench: Bench) -> Vector:
+    """Return a pose (n,) from which a joint gets up speed before it comes to a soft limit; the seed says which."""
+    return at_limit(bench.robot, np.random.default_rng(bench.seed), _RUN_UP)[0]
+
+
+def against_limit(bench: Bench) -> Act:
+    """The joint of `before_limit` against its limit for ever, and all others somewhere."""
+    _, joint, outward = at_limit(bench.robot, np.random.default_rng(bench.seed), _RUN_UP)
+    sign = bench.random.choice([-1.0, 1.0], bench.robot.dof)
+    sign[joint] = outward
+    return lambda _time, _position: sign

@@ -26,7 +26,7 @@ def shaped_scenario(
     number: int,
     name: str,
     provoked: str,
-    act: Callable[[Robot, np.random.Generator], Act],
+    act: Callable[[Bench], Act],
     asked: Callable[[NDArray[Any], Robot], bool],
     targets: Callable[[Act], Policy] = velocities,
     pace: Pace = lambda _: 0.0,
@@ -49,7 +49,7 @@ def shaped_scenario(
         trial = Trial()
         with Bench(robot, backend, seed) as bench:
             bench.place(start(bench))
-            bench.start(targets(act(robot, bench.random)))
+            bench.start(targets(act(bench)))
             begun = bench.now_ns
             while bench.now_ns - begun < _SECONDS * 1e9 and not bench.trips:
                 bench.tick(pace(bench))

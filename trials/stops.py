@@ -15,10 +15,11 @@ from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears, go_on
 from robotctl.trials.faults import Fault
 from robotctl.trials.measure import measure_stop
-from robotctl.trials.policies import sway
+from robotctl.trials.policies import sway, velocities
 from robotctl.trials.scenario import Scenario, Trial
 
 _LEAD_S = 0.4
+_STILL_S = 0.2
 _MOMENTS_S = 1.0
 _WATCH_S = 1.0
 """How long an arm at rest is watched, with its policy still at work, before the operator does something."""
@@ -74,6 +75,12 @@ def running(bench: Bench) -> None:
     """Let a policy swing the arm about, until a moment that the seed chooses."""
     bench.start(sway(bench))
     bench.run(_LEAD_S + bench.random.uniform(0.0, _MOMENTS_S))
+
+
+def still(bench: Bench) -> None:
+    """Let a policy hold the arm where it is."""
+    bench.start(velocities(lambda _time, position: np.zeros_like(position)))
+    bench.run(_STILL_S)
 
 
 def stop_scenario(

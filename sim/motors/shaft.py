@@ -43,6 +43,10 @@ class Shaft:
         if self._runaway is not None:
             return
         scale, part = self._scale, self._part
+        if part < 0.0:  # MuJoCo's implicit step takes no negative damping
+            angle, speed, _ = self.state()
+            effort += kp * (position - angle) + kd * (velocity - speed)
+            kp = kd = 0.0
         square = part * self._square
         self._plant.drive(
             self._axis,

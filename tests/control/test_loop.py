@@ -669,6 +669,18 @@ def test_an_arm_is_not_damped_by_where_it_was_once():
     assert not any(drive.enabled for drive in bench.drives)
 
 
+@pytest.mark.parametrize(("speed", "seconds", "on"), [(1.3, 0.05, True), (1.1, 0.5, True), (1.3, 0.2, False)])
+def test_a_drive_that_runs_away_while_the_arm_is_damped_is_switched_off(speed, seconds, on):
+    bench = Bench(load_robot("openarm")).reach(State.ARMED)
+    bench.loop.estop("a test")
+    bench.until(State.FAULT)
+    fast = np.zeros(7)
+    fast[3] = speed * bench.robot.limits.velocity[3]
+    bench.arm.alter = lambda sample: sample._replace(velocity=fast)
+    bench.tick(round(seconds * bench.robot.profile.servo_hz))
+    assert bench.arm.arm.enabled is on
+
+
 def test_a_joint_that_is_not_heard_of_is_not_pushed_about(bench):
     """What the integrator sees of it is an error that does not change, whatever it does."""
     bench.reach(State.ARMED)

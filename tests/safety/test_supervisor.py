@@ -570,6 +570,22 @@ def test_an_arm_is_not_stopped_for_what_did_not_leave_before_it_was_armed():
     assert bench.observe() is State.ARMED
 
 
+@pytest.mark.parametrize("state", [State.READY, State.STOPPING])
+def test_a_joint_that_stays_too_fast_for_100_ms_runs_away(state):
+    bench = Bench(state)
+    bench.observe()
+    bench.velocity[2] = -1.21 * ROBOT.limits.velocity[2]
+    bench.led = bench.velocity
+    # Three samples to be sure that it is too fast.
+    bench.observe_until(bench.now + 100 * MS + 2 * PERIOD)
+    assert not bench.supervisor.runs_away
+    bench.observe()
+    assert bench.supervisor.runs_away
+    bench.velocity[2] = 0.0
+    bench.observe()
+    assert not bench.supervisor.runs_away
+
+
 def test_a_refused_event_changes_nothing():
     supervisor = Bench(State.READY).supervisor
     before = supervisor.epoch

@@ -95,3 +95,19 @@ def test_a_push_moves_the_arm_and_ends(panda: Robot) -> None:
     plant.push(np.zeros(7))
     plant.advance(3000 * MS)
     assert plant.truth().position[0] < 0.5 * pushed
+
+
+def test_a_jammed_joint_stands_however_light_it_is() -> None:
+    robot = load_robot("xarm7")
+    plant = Plant(robot)
+    for axis in range(7):
+        plant.drive(axis, 100.0, 2.0, plant.axis(axis).position, 0.0, 0.0)
+    plant.data.qvel[6] = 1.5
+    where = plant.axis(6).position
+    plant.jam(6, jammed=True)
+    plant.drive(6, 40.0, 0.5, where + 0.4, 1.0, 0.0)
+    plant.advance(500_000_000)
+    assert plant.axis(6).position == pytest.approx(where, abs=0.02)
+    plant.jam(6, jammed=False)
+    plant.advance(2_000_000_000)
+    assert plant.axis(6).position == pytest.approx(where + 0.4, abs=0.02)

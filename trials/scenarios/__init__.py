@@ -2,9 +2,19 @@
 
 from robotctl.hal.robot import Robot
 from robotctl.trials.scenario import Scenario
-from robotctl.trials.scenarios import bus, configuration, guarded, limits, machine, measured, operator, policy
+from robotctl.trials.scenarios import (
+    bus,
+    configuration,
+    guarded,
+    limits,
+    machine,
+    measured,
+    operator,
+    policy,
+    proximity,
+)
 
-_MODULES = (limits, guarded, measured, policy, machine, bus, operator, configuration)
+_MODULES = (limits, guarded, measured, policy, machine, bus, operator, proximity, configuration)
 
 
 def scenarios(robot: Robot, backend: str) -> list[Scenario]:

@@ -15,7 +15,7 @@ from robotctl.sim.trouble import Garble, Trouble
 from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
 from robotctl.trials.faults import Planted, between, fastest
-from robotctl.trials.policies import against_limits, velocities
+from robotctl.trials.policies import against_limit, before_limit, velocities
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.stops import Expected, Start, running, stop_scenario
 
@@ -120,8 +120,9 @@ def _enabled_too_early(bench: Bench) -> Planted:
 
 
 def _pushing(bench: Bench) -> None:
-    bench.start(velocities(against_limits(bench.robot, bench.random)))
-    bench.run(0.2)
+    bench.place(before_limit(bench))
+    bench.start(velocities(against_limit(bench)))
+    bench.run(0.05)
 
 
 def _elsewhere(bench: Bench) -> Planted:
@@ -159,7 +160,14 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
             "guard, limit",
             "a bug: the shaper forgets the soft limits under a policy that pushes",
             _shaper_that_does_not_stop,
-            Expected(protection=Protection.SOFT_LIMIT, category=Category.BRAKE_OFF, clears=Clears.POWER, within_s=10.0),
+            Expected(
+                protection=Protection.SOFT_LIMIT,
+                category=Category.BRAKE_OFF,
+                clears=Clears.POWER,
+                within_s=3.0,
+                rest_s=0.5,  # braking that rounds to more than the guard allows is cut off
+                excused=frozenset({"position"}),  # the guard lets pass what the shaper keeps free for tracking
+            ),
             _pushing,
         ),
         bug(Protection.ACCELERATION, "guard, step", "20 times an acceleration cap", _garbled("velocity", _too_hard)),

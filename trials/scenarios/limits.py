@@ -3,13 +3,13 @@
 from robotctl.hal.robot import Robot
 from robotctl.safety.shaper import Clip
 from robotctl.trials.bench import Bench
-from robotctl.trials.policies import against_limits, bang_bang, outward, random
+from robotctl.trials.policies import Act, against_limit, bang_bang, before_limit, outward, random
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.shaping import clipped, shaped_scenario, too_fast
 
 _OFTEN_LATE = 0.15
 _LATEST = 2.0
-"""Servo periods; three ticks in a row never come so late."""
+"""Servo periods; never so many ticks in a row that P11 would mind."""
 
 
 def jitter(bench: Bench) -> float:
@@ -19,24 +19,28 @@ def jitter(bench: Bench) -> float:
     return float(bench.random.uniform(0.0, 0.5))
 
 
+def _random(bench: Bench) -> Act:
+    return random(bench.robot, bench.random)
+
+
+def _outward(bench: Bench) -> Act:
+    return outward(bench.robot, bench.random)
+
+
+def _steps(bench: Bench) -> Act:
+    return bang_bang(bench.robot, bench.random)
+
+
 def scenarios(_robot: Robot, _backend: str) -> list[Scenario]:
+    steps, limited = "full speed to and fro, in steps", clipped(Clip.POSITION)
     return [
-        shaped_scenario(1, "twice the cap", "a policy asks for up to twice every velocity cap", random, too_fast),
+        shaped_scenario(1, "twice the cap", "a policy asks for up to twice every velocity cap", _random, too_fast),
         shaped_scenario(
-            2,
-            "into the limits",
-            "a policy pushes every joint against its limits",
-            against_limits,
-            clipped(Clip.POSITION),
+            2, "into a limit", "a policy pushes a joint against its limit", against_limit, limited, start=before_limit
         ),
-        shaped_scenario(4, "outward", "a policy pushes the tool out of its sphere", outward, clipped(Clip.SPHERE)),
-        shaped_scenario(6, "steps", "a policy asks for full speed to and fro, in steps", bang_bang, too_fast),
+        shaped_scenario(4, "outward", "a policy pushes the tool out of its sphere", _outward, clipped(Clip.SPHERE)),
+        shaped_scenario(6, "steps", f"a policy asks for {steps}", _steps, too_fast),
         shaped_scenario(
-            6,
-            "steps under jitter",
-            "the same, with ticks 0.5 to 3 servo periods apart",
-            bang_bang,
-            too_fast,
-            pace=jitter,
+            6, "steps under jitter", "the same, with ticks 0.5 to 3 periods apart", _steps, too_fast, pace=jitter
         ),
     ]

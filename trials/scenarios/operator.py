@@ -5,13 +5,14 @@ from collections.abc import Callable
 import numpy as np
 
 from robotctl.control.operator import Verb
+from robotctl.control.resetting import PAUSES_S
 from robotctl.hal.robot import Robot
 from robotctl.safety.deadman import Grip
 from robotctl.safety.machine import State
 from robotctl.safety.trip import Category, Protection
 from robotctl.sim.trouble import Misread
 from robotctl.trials.bench import Bench
-from robotctl.trials.faults import Planted, between
+from robotctl.trials.faults import Planted, between, stuck
 from robotctl.trials.refusals import refusal_scenario
 from robotctl.trials.resuming import resuming_scenario
 from robotctl.trials.scenario import Scenario
@@ -188,9 +189,25 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
             Expected(
                 protection=Protection.RESET,
                 category=Category.BRAKE_HOLD,
-                within_s=2.2 + robot.stopping_time_s,
+                within_s=(len(PAUSES_S) + 1) * (2.1 + robot.stopping_time_s)
+                + sum(PAUSES_S)
+                + len(PAUSES_S) * robot.stopping_time_s,
             ),
             _armed,
+        ),
+        stop_scenario(
+            29,
+            "blocked",
+            "a joint seizes up on the way home",
+            stuck,
+            Expected(
+                protection=Protection.TRACKING,
+                category=Category.BRAKE_OFF,
+                within_s=1.0,
+                rest_s=1.5,
+                excused=frozenset({"velocity"}),
+            ),
+            _resetting,
         ),
         stop_scenario(
             30,

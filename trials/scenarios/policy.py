@@ -13,7 +13,7 @@ from robotctl.safety.trip import Category, Protection
 from robotctl.trials.bench import POLICY_S, Bench, Policy
 from robotctl.trials.clearing import Clears
 from robotctl.trials.faults import Planted
-from robotctl.trials.policies import outward, random, torques
+from robotctl.trials.policies import Act, outward, random, torques
 from robotctl.trials.resuming import resuming_scenario
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.shaping import shaped_scenario
@@ -96,6 +96,14 @@ def _of_yesterday(_bench: Bench, before: Policy) -> Policy:
     return policy
 
 
+def _outward(bench: Bench) -> Act:
+    return outward(bench.robot, bench.random)
+
+
+def _random(bench: Bench) -> Act:
+    return random(bench.robot, bench.random)
+
+
 def _strong(records: NDArray[Any], robot: Robot) -> bool:
     return bool((np.abs(records["wanted"]) > 0.3 * robot.limits.torque).any(axis=1).mean() > 0.1)
 
@@ -120,8 +128,8 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         "nothing": lambda _: np.zeros(0),
     }
     return [
-        shaped_scenario(8, "outward torque", "torques push the tool out of its sphere", outward, _strong, torques),
-        shaped_scenario(8, "random torque", "random torques", random, _strong, torques),
+        shaped_scenario(8, "outward torque", "torques push the tool out of its sphere", _outward, _strong, torques),
+        shaped_scenario(8, "random torque", "random torques", _random, _strong, torques),
         *(stop_scenario(9, name, f"a policy sends {name}", _once(values), malformed) for name, values in bad.items()),
         stop_scenario(
             9, "again and again", "a policy sends NaN three times in a row", _once(_with(np.nan), 3), repeated
