@@ -1,22 +1,22 @@
 """P27: the watchman, a process beside every control process, which takes the drives when that one falls silent.
 
-It sees the control process in the ring of ticks, whose head moves in every tick, and through a pidfd. When the
-process is gone without having switched its drives off, or its loop misses its beats for `safety.watchman_s` while
-it holds them, the watchman ends it for good, so that it can never wake up and send another frame, and does the
-profile's category 0 action in its place. It outlives the operator's process; it ends when the control process has.
+It sees the loop in the ring of ticks, whose head moves in every tick, and the process in /proc. When that is gone
+without having switched its drives off, or its loop misses its beats for `safety.watchman_s` while it holds them, the
+watchman ends it for good, so that it can never wake up and send another frame, and does the profile's category 0
+action in its place. It outlives the operator's process; it ends when the control process has.
 
 Drives that live in the control process, as the twin's and emulated ones do, go with it: then all there is to do is
 to sound the alarm.
 """
 
 import json
-import select
 import signal
 import sys
 from dataclasses import asdict, dataclass
 
 from robotctl.control import registry
 from robotctl.control.legacy import Legacy, sound
+from robotctl.control.other_process import OtherProcess
 from robotctl.control.process_tools import WATCHMAN_PRIORITY, go_real_time, name_process
 from robotctl.control.pulse import Pulse
 from robotctl.control.rescue import Rescue
@@ -28,7 +28,7 @@ from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.machine import State
 
 _LOOK_MS = 5
-"""Between two looks at the loop; that its process is gone is known at once."""
+"""Between two looks at the loop and its process."""
 LONGEST_RESCUE_S = 9
 """A bus can block whoever writes to it. Nobody may be left to end a watchman that hangs, so it ends by itself."""
 
@@ -66,11 +66,9 @@ class Watchman:
         self._pulse = Pulse()
         self._silence_ns = 0
 
-    def watch(self, control_fd: int) -> None:
-        """Return once the process behind a pidfd has ended, and its drives are off if that is in anybody's power."""
-        end = select.poll()
-        end.register(control_fd, select.POLLIN)
-        while not end.poll(_LOOK_MS):
+    def watch(self, control: OtherProcess) -> None:
+        """Return once the control process is over, and its drives are off if that is in anybody's power."""
+        while not control.is_over(_LOOK_MS):
             self._link.watch.beat()
             if not self.has_fallen_silent():
                 continue
@@ -79,7 +77,7 @@ class Watchman:
                 sound(f"P27: {what}; its drives live in the same process")
                 continue
             onset = self._clock.now_ns() - self._silence_ns + self._patience_ns
-            signal.pidfd_send_signal(control_fd, signal.SIGKILL)  # stopped or late, it never sends a frame again
+            control.kill()  # it must not wake up and send another frame
             _run(self._rescue, f"{what}, and its process was ended", onset)
             return
         if self._link.watch.power is not Power.OFF:
@@ -119,7 +117,7 @@ def main(text: str) -> int:
         signal.signal(number, signal.SIG_IGN)  # while there is a control process, somebody has to watch it
     robot = load_robot(config.robot, config.overrides)
     link = Link.attach(config.mailbox_fd, config.board_fd, robot.dof, config.slots)
-    clock = MonotonicClock()
+    control, clock = OtherProcess(config.control, config.control_fd), MonotonicClock()
     rescue = None
     if is_shared(config.channel):
         prepare_channel(config.channel)
@@ -128,7 +126,7 @@ def main(text: str) -> int:
     entry = registry.register(name, config.backend, config.channel, config.operator, watches=config.control)
     try:
         go_real_time(WATCHMAN_PRIORITY)
-        Watchman(robot, link, clock, rescue).watch(config.control_fd)
+        Watchman(robot, link, clock, rescue).watch(control)
     finally:
         registry.unregister(config.control)  # one that was killed could not do it itself
         entry.unlink(missing_ok=True)

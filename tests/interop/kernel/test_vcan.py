@@ -8,13 +8,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
+from robotctl.control.kinematics import Kinematics
 from robotctl.hal.backend import open_backend
 from robotctl.hal.can.channel import open_channel
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import BusError
 from robotctl.hal.robot import load_robot
+from robotctl.hal.types import Command, CommandMode
 
 if not Path("/sys/class/net/vcan0").exists():
     pytest.skip("needs a vcan0 interface; tests/interop/test_kernel_can.py boots one", allow_module_level=True)
@@ -25,9 +28,10 @@ SLOW = ["servo_hz=50"]
 
 
 @pytest.fixture
-def emulator(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+def emulator(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[subprocess.Popen[bytes]]:
     announcement = tmp_path / "emulate.json"
-    process = subprocess.Popen([*ROBOTCTL, "emulate", "--channel", CHANNEL, "--json", str(announcement)])
+    options = getattr(request, "param", [])
+    process = subprocess.Popen([*ROBOTCTL, "emulate", "--channel", CHANNEL, "--json", str(announcement), *options])
     deadline = time.monotonic() + 60
     while not announcement.exists():
         assert process.poll() is None
@@ -96,3 +100,25 @@ def test_the_arm_comes_up_follows_and_is_let_go_by_its_own_watchdog(emulator: su
         assert not lost.enabled
         assert {fault.name for fault in lost.faults} == {"COMMUNICATION_LOST"}
         arm.disable()
+
+
+@pytest.mark.parametrize("emulator", [["--register", "all:TIMEOUT=40000"]], ids=["patient"], indirect=True)
+def test_drives_that_another_enabled_are_taken_over_through_a_second_socket(emulator: subprocess.Popen[bytes]) -> None:
+    robot, clock = load_robot("openarm", [*SLOW, "safety.drive_timeout_s=2"]), MonotonicClock()
+    with open_backend("can", robot, clock, CHANNEL).arm as first:
+        first.verify()
+        first.enable()
+        first.hold()
+        pose = first.read().position
+        second = open_backend("can", robot, clock, CHANNEL).arm
+        damping = Command(CommandMode.DAMP, pose, np.zeros(7), Kinematics(robot).gravity(pose))
+        second.take_over(damping)
+        for _ in range(25):
+            second.write(damping)
+            clock.sleep_until(clock.now_ns() + 20_000_000)
+        sample = second.read()
+        assert sample.enabled
+        assert sample.position == pytest.approx(pose, abs=0.1)
+        second.disable()
+        assert not second.read().enabled
+        second.close()
