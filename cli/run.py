@@ -73,10 +73,10 @@ def run(
         session: Session
         actor: Actor
         if fast:
-            session = LockstepSession(model, backend, channel)
+            session = LockstepSession(model, backend, channel, work.reset)
             actor = InlineActor(session, work, policy, seed)
         else:
-            session = ProcessSession(model, backend, channel, overrides)
+            session = ProcessSession(model, backend, channel, overrides, work.reset)
             actor = ProcessActor(session, work, policy, seed, overrides)
         session.on_page = partial(_page, console)
         name = model.profile.name

@@ -6,6 +6,8 @@ It runs in real time in a process of its own (`control.process`) or in lockstep 
 (`control.session`), unchanged.
 """
 
+from collections.abc import Sequence
+
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.motion import Motion
 from robotctl.control.neighbours import Neighbours
@@ -13,6 +15,7 @@ from robotctl.control.operator import Operator, Verb
 from robotctl.control.powering import Powering
 from robotctl.control.publisher import Publisher
 from robotctl.control.shared import Link
+from robotctl.control.task_reset import Step, TaskReset
 from robotctl.hal.backend import Rig
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError
@@ -34,7 +37,12 @@ _MOVING = (State.RUN, State.RESET)
 class Loop:
     """The control of one arm. `link` is where targets and requests come from and ticks and events go to."""
 
-    def __init__(self, robot: Robot, rig: Rig, clock: Clock, link: Link) -> None:
+    def __init__(self, robot: Robot, rig: Rig, clock: Clock, link: Link, reset: Sequence[Step] = ()) -> None:
+        """Build everything that a tick needs; `reset` holds the steps of TASK_RESET.
+
+        Raises:
+            ConfigError: if the robot's model is not that of its profile, or it cannot do one of the steps.
+        """
         self.robot = robot
         self.kinematics = Kinematics(robot)
         self._motion = Motion(robot, self.kinematics)
@@ -53,7 +61,10 @@ class Loop:
         rig.arm.inspect_with(self._guard)
         self._publisher = Publisher(link, clock, robot.dof)
         self._powering = Powering(robot, rig.arm, self._motion, self.supervisor, link.watch, self._publisher.log)
-        self._operator = Operator(robot, rig.arm, self.kinematics, self._motion, self.supervisor, self._powering, link)
+        task_reset = TaskReset(robot, self.kinematics, rig.gripper, reset)
+        self._operator = Operator(
+            robot, rig.arm, self.kinematics, self._motion, self.supervisor, self._powering, link, task_reset
+        )
         self._estop = ""
 
     # -- life -----------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from robotctl.control.motion import Motion
 from robotctl.control.powering import Powering
 from robotctl.control.resetting import Resetting
 from robotctl.control.shared import Link
+from robotctl.control.task_reset import TaskReset
 from robotctl.hal.arm import Arm
 from robotctl.hal.errors import RobotctlError
 from robotctl.hal.robot import Robot
@@ -38,6 +39,8 @@ class Verb(IntEnum):
     """Again, after one that failed."""
     RANDOM_START = 13
     """With a seed as argument."""
+    TASK_RESET = 14
+    """The steps that the session's task brought along."""
 
 
 _VERBS = frozenset(Verb)
@@ -55,6 +58,7 @@ class Operator:
         supervisor: Supervisor,
         powering: Powering,
         link: Link,
+        task_reset: TaskReset,
     ) -> None:
         self._robot = robot
         self._arm = arm
@@ -63,6 +67,7 @@ class Operator:
         self._supervisor = supervisor
         self._powering = powering
         self._link = link
+        self._task_reset = task_reset
         self._resetting: Resetting | None = None
         self._answer: tuple[int, str] | None = None
 
@@ -140,6 +145,11 @@ class Operator:
             case Verb.RANDOM_START:
                 seed = self._link.desk.argument
                 self._reset([RandomStart(self._robot, seed, self._kinematics, self._motion.scene)], now_ns)
+            case Verb.TASK_RESET:
+                routines = self._task_reset.routines()
+                if not routines:
+                    raise RobotctlError("the task has no reset")
+                self._reset(routines, now_ns)
             case Verb.STOP:
                 supervisor.handle(Event.STOP)
             case Verb.DISARM:

@@ -9,12 +9,14 @@ import os
 import signal
 import sys
 from dataclasses import asdict, dataclass
+from typing import Any
 
 from robotctl.control import registry
 from robotctl.control.loop import Loop
 from robotctl.control.operator import Verb
 from robotctl.control.process_tools import go_real_time, name_process, signal_on_parent_death
 from robotctl.control.shared import Link, Power
+from robotctl.control.task_reset import parse
 from robotctl.hal.backend import open_backend
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import ConfigError, RobotctlError
@@ -40,6 +42,8 @@ class ProcessConfig:
     """Pid of the operator's process."""
     limits: str
     """The limits that the operator's process has seen: `Robot.limits_text`."""
+    reset: list[dict[str, Any]]
+    """The steps of TASK_RESET."""
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))
@@ -57,7 +61,8 @@ def main(text: str) -> int:
             raise ConfigError(f"{robot.source}: limits changed while it was being started:\n{changes}", "start again")
         link = Link.attach(config.mailbox_fd, config.board_fd, robot.dof, config.slots)
         clock = MonotonicClock()
-        loop = Loop(robot, open_backend(config.backend, robot, clock, config.channel), clock, link)
+        rig = open_backend(config.backend, robot, clock, config.channel)
+        loop = Loop(robot, rig, clock, link, parse(config.reset))
     except RobotctlError as error:
         print(error, file=sys.stderr)  # noqa: T201 - the memory is not mapped yet; the operator reads this
         return 2 if isinstance(error, ConfigError) else 4

@@ -16,6 +16,7 @@ from robotctl.control.process import ProcessConfig
 from robotctl.control.rehearsal import Rehearsal, rehearse
 from robotctl.control.session import Session, Stopped, history_slots
 from robotctl.control.shared import Link
+from robotctl.control.task_reset import Step, dump
 from robotctl.control.watchman import LONGEST_RESCUE_S, WatchmanConfig
 from robotctl.hal.can.channel import is_shared
 from robotctl.hal.clock import MonotonicClock
@@ -35,11 +36,20 @@ _CLOSABLE = (State.READY, State.FAULT, State.SILENT)
 class ProcessSession(Session):
     """Starts, watches and ends one control process and its watchman."""
 
-    def __init__(self, robot: Robot, backend: str, channel: str = "", overrides: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        backend: str,
+        channel: str = "",
+        overrides: Sequence[str] = (),
+        reset: Sequence[Step] = (),
+    ) -> None:
+        """Take what the control process will be told; `reset` holds the steps of TASK_RESET."""
         super().__init__(robot, MonotonicClock(), Link.create(robot.dof, history_slots(robot)))
         self._backend = backend
         self._channel = channel
         self._overrides = list(overrides)
+        self._reset = list(reset)
         self._process: subprocess.Popen[bytes] | None = None
         self._watchman: subprocess.Popen[bytes] | None = None
         self._claim: socket.socket | None = None
@@ -80,6 +90,7 @@ class ProcessSession(Session):
             slots=self.link.ticks.slots,
             operator=os.getpid(),
             limits=self.robot.limits_text,
+            reset=dump(self._reset),
         )
         shared = [mailbox, board]
         if is_shared(self._channel):
@@ -125,7 +136,7 @@ class ProcessSession(Session):
         Lockstep sessions have no rehearsal: their arm is the twin. Settling needs none.
         """
         if self.state is State.ARMED and routine is not Verb.SETTLE:
-            found = rehearse(self.robot, self.latest()["position"], routine, argument)
+            found = rehearse(self.robot, self.latest()["position"], routine, argument, self._reset)
             self.rehearsals.append(found)
             if found.objection:
                 text = f"{routine.name} was rehearsed in the twin and is refused: {found.objection}"

@@ -1,12 +1,13 @@
 """Rehearsals: a reset routine runs in the MuJoCo twin first, from where the real arm was measured."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from robotctl.control.operator import Verb
 from robotctl.control.session import LockstepSession, Session, Stopped
+from robotctl.control.task_reset import Step
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
 from robotctl.safety.machine import State
@@ -39,7 +40,7 @@ class Rehearsal:
         return "; ".join([self.failure] * bool(self.failure) + [f"it violated {each}" for each in broken])
 
 
-def rehearse(robot: Robot, start: Vector, routine: Verb, argument: int = 0) -> Rehearsal:
+def rehearse(robot: Robot, start: Vector, routine: Verb, argument: int = 0, reset: Sequence[Step] = ()) -> Rehearsal:
     """Run a reset routine in the twin, as fast as the machine allows, and say how it went.
 
     The twin knows the arm's limits, regions and dynamics, and nothing of what stands around it. It wakes up in the
@@ -47,10 +48,11 @@ def rehearse(robot: Robot, start: Vector, routine: Verb, argument: int = 0) -> R
 
     Args:
         start: measured joints (n,), rad.
+        reset: the steps of TASK_RESET. The twin has nothing to push or to hold, so they take the whole way.
     """
     twin = robot.profile.twin.model_copy(update={"start": start.tolist()})
     there = replace(robot, profile=robot.profile.model_copy(update={"twin": twin}))
-    with LockstepSession(there, _BACKEND) as session:
+    with LockstepSession(there, _BACKEND, reset=reset) as session:
         session.request(Verb.ARM)
         session.advance(robot.period_ns * 1e-9)
         failure = ""
@@ -71,13 +73,13 @@ def _run(session: Session, routine: Verb, argument: int) -> str:
         session.request(routine, argument)
     except Stopped as error:
         return error.what
-    began, before = session.clock.now_ns(), session.latest()["command_position"]
+    ring, window = session.link.ticks, round(_STALL_S * session.robot.profile.servo_hz)
+    first = ring.head
     while session.state is State.RESET:
         session.advance(0.05)
-        if session.clock.now_ns() - began >= _STALL_S * 1e9:
-            position = session.latest()["command_position"]
-            if np.abs(position - before).max() < _STALL:
-                held = Clip(int(session.latest()["clip"])).name
-                return f"it got no further, held back by {held}"
-            began, before = session.clock.now_ns(), position
+        if ring.head - first >= window:
+            records, first, _ = ring.since(first)
+            if np.abs(records[-1]["command_position"] - records[0]["command_position"]).max() < _STALL:
+                held = Clip(int(np.bitwise_or.reduce(records["clip"])))
+                return f"it got no further, held back by {held.name}"
     return "" if session.state is State.ARMED else session.trips[-1]["text"]

@@ -1,8 +1,9 @@
 """A session: one arm with its loop, as its operator sees it. In lockstep here; in a process in `process_session`."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
@@ -12,7 +13,8 @@ from robotctl.control.loop import Loop
 from robotctl.control.operator import Verb
 from robotctl.control.shared import Link
 from robotctl.control.statistics import TickStatistics
-from robotctl.hal.backend import open_backend
+from robotctl.control.task_reset import Step
+from robotctl.hal.backend import BackendFactory, open_backend
 from robotctl.hal.clock import Clock, VirtualClock
 from robotctl.hal.errors import HardwareError, RobotctlError
 from robotctl.hal.robot import Robot
@@ -268,11 +270,15 @@ class Session(ABC):
 class LockstepSession(Session):
     """The loop in this process on a virtual clock: as fast as the machine allows, the same every time."""
 
-    def __init__(self, robot: Robot, backend: str, channel: str = "") -> None:
+    def __init__(
+        self, robot: Robot, backend: str | BackendFactory, channel: str = "", reset: Sequence[Step] = ()
+    ) -> None:
+        """Take a backend by name, or one of your own; `reset` holds the steps of TASK_RESET."""
         clock = VirtualClock()
         super().__init__(robot, clock, Link.local(robot.dof, history_slots(robot)))
-        self._rig = open_backend(backend, robot, clock, channel)
-        self.loop = Loop(robot, self._rig, clock, self.link)
+        make = partial(open_backend, backend) if isinstance(backend, str) else backend
+        self._rig = make(robot, clock, channel)
+        self.loop = Loop(robot, self._rig, clock, self.link, reset)
         self._next_ns = 0
 
     def open(self) -> None:

@@ -63,6 +63,9 @@ def run_episodes(
     try:
         session.prepare()
         for index in range(episodes):
+            if task.reset:
+                session.reset(Verb.TASK_RESET)
+                session.reset()
             goal = task.goal(session.robot, kinematics, seed, index)
             episode = _run_episode(session, actor, task, goal, rate)
             outcome.episodes.append(episode)

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from robotctl.control.kinematics import Kinematics
+from robotctl.control.task_reset import Step
 from robotctl.hal.document import read_document
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import CONFIGS, Robot
@@ -33,6 +34,8 @@ class ReachTask(BaseModel):
     """An episode ends early once the tool stays this close, m ..."""
     settled_steps: Annotated[int, Field(ge=1)]
     """... for this many policy steps."""
+    reset: list[Step] = []
+    """Steps that set the scene right before every episode; see `control.task_reset`."""
 
     def goal(self, robot: Robot, kinematics: Kinematics, seed: int, episode: int) -> Vector:
         """Return the target point (3,) of one episode, the same for the same seed.

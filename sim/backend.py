@@ -15,17 +15,18 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Fault, GripperSample, Sample, Sent, Truth, Vector, frozen
 from robotctl.sim.motors.thermal import AMBIENT, Thermal
 from robotctl.sim.plant import WATCHDOG_SHARE, Plant
+from robotctl.sim.scene import Scene
 
 _WARM_NS = 100_000_000
 """Step of the thermal models."""
 _COMMUNICATION_LOST = 0xD
 
 
-def open_sim(robot: Robot, clock: Clock, channel: str = "") -> Rig:
+def open_sim(robot: Robot, clock: Clock, channel: str = "", scene: Scene | None = None) -> Rig:
     """Return the twin of a robot. Entry point `sim` of the group `robotctl.backends`."""
     if channel:
         raise ConfigError(f"the sim backend has no channel, got {channel!r}", "use --backend can, or drop --channel")
-    plant = Plant(robot, clock.now_ns())
+    plant = Plant(robot, clock.now_ns(), scene)
     arm = SimArm(robot, plant, clock)
     gripper = SimGripper(robot.profile.gripper, plant, clock, arm) if robot.profile.gripper else None
     return Rig(arm, gripper)

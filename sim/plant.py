@@ -15,6 +15,7 @@ from robotctl.hal.errors import ConfigError
 from robotctl.hal.profile import GripperProfile, RobotProfile
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Truth, Vector
+from robotctl.sim.scene import Scene
 
 PHYSICS_STEP_NS = 1_000_000
 WATCHDOG_SHARE = 0.8
@@ -41,12 +42,12 @@ class Plant:
     Time moves by `advance`; between two calls the latest drive commands act. Nothing here reads a clock.
     """
 
-    def __init__(self, robot: Robot, start_ns: int = 0) -> None:
-        """Build the plant at rest where the profile says, all drives off."""
+    def __init__(self, robot: Robot, start_ns: int = 0, scene: Scene | None = None) -> None:
+        """Build the plant at rest where the profile says, all drives off, with a scene around it if there is one."""
         profile = robot.profile
         self.time_ns = start_ns
         self.dof = robot.dof
-        self.model, actuators = _build(robot)
+        self.model, actuators = _build(robot, scene)
         self.data = mujoco.MjData(self.model)
         joints = [joint.name for joint in profile.joints]
         self.axes = robot.dof + (1 if profile.gripper else 0)
@@ -184,7 +185,7 @@ class Plant:
         self.model.dof_invweight0[dof] = min(weight, 1.0 / _BRAKE_ARMATURE) if held else weight
 
 
-def _build(robot: Robot) -> tuple[mujoco.MjModel, list[int]]:
+def _build(robot: Robot, scene: Scene | None) -> tuple[mujoco.MjModel, list[int]]:
     profile = robot.profile
     spec = mujoco.MjSpec.from_string(robot.description.xml)
     spec.option.timestep = PHYSICS_STEP_NS * 1e-9
@@ -195,6 +196,8 @@ def _build(robot: Robot) -> tuple[mujoco.MjModel, list[int]]:
     if profile.gripper:
         _couple_fingers(spec, profile.gripper)
         _add_drive(spec, profile.gripper.fingers[0].name, profile.gripper.force, 0.0)
+    if scene is not None:
+        scene.add(spec)
     model = spec.compile()
     return model, list(range(model.nu))
 

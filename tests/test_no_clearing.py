@@ -11,7 +11,6 @@ import pytest
 from robotctl.control.loop import Verb
 from robotctl.control.session import LockstepSession, Stopped
 from robotctl.hal.can.damiao.codec import Special
-from robotctl.hal.errors import HardwareError
 from robotctl.hal.robot import load_robot
 from robotctl.safety.machine import State
 from robotctl.safety.target import JointVelocity
@@ -89,16 +88,15 @@ def test_no_frame_clears_a_fault_whatever_happens_and_whatever_is_asked(name: st
         if seq == 30:
             bus.bench.trouble.add(trouble)
     assert session.trips
+    # One more drive fails, so that the self-test after an acknowledgement meets a fault.
+    bus.bench.trouble.add(Failure(motor_id=1))
     for _ in range(2):
         for verb in (Verb.ACK, Verb.SELFTEST, Verb.ARM, Verb.START, Verb.HOME, Verb.STOP, Verb.DISARM, Verb.ESTOP):
             with suppress(Stopped):
                 session.request(verb)
             session.advance(0.5)
         bus.bench.trouble.remove(trouble)
-    with suppress(HardwareError):
-        session.close()
     assert len(frames) > 5000
     assert not any(clears(frame) for frame in frames)
-    # Nobody has even tried.
-    assert not any("CLEAR" in trip["text"] for trip in session.trips)
+    assert session._rig.arm._transport.withheld == 0  # the guard was not even asked for one
     assert session.state is not State.RUN

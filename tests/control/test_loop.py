@@ -9,6 +9,7 @@ from robotctl.control.loop import Loop
 from robotctl.control.operator import Verb
 from robotctl.control.session import LockstepSession, Stopped
 from robotctl.control.shared import Link, Power
+from robotctl.control.task_reset import PoseStep
 from robotctl.hal.arm import Arm
 from robotctl.hal.backend import Rig, open_backend
 from robotctl.hal.clock import VirtualClock
@@ -89,7 +90,8 @@ class Bench:
         rig = open_backend("sim", robot, self.clock)
         self.plant = rig.arm._plant
         self.arm = RecordingArm(rig.arm)
-        self.loop = Loop(robot, Rig(self.arm, rig.gripper), self.clock, self.link)
+        steps = [PoseStep(pose=robot.profile.home)]
+        self.loop = Loop(robot, Rig(self.arm, rig.gripper), self.clock, self.link, steps)
         self.supervisor = self.loop.supervisor
         self.seq = 0
         self.cursor = 0
@@ -181,7 +183,7 @@ def bench(panda):
 
 # -- verbs ---------------------------------------------------------------------------------------------------------
 
-RESETS = {Verb.HOME, Verb.PARK, Verb.RETREAT, Verb.SETTLE, Verb.RANDOM_START}
+RESETS = {Verb.HOME, Verb.PARK, Verb.RETREAT, Verb.SETTLE, Verb.RANDOM_START, Verb.TASK_RESET}
 ALLOWED = {
     State.READY: {Verb.ARM, Verb.CLOSE},
     State.ARMED: {Verb.START, Verb.STOP, Verb.DISARM, *RESETS},

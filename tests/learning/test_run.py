@@ -8,6 +8,7 @@ import pytest
 
 from robotctl.control.recording_session import SessionRecording
 from robotctl.control.session import LockstepSession
+from robotctl.control.task_reset import parse
 from robotctl.hal.robot import load_robot, robot_names
 from robotctl.learning.actor import InlineActor
 from robotctl.learning.run import Outcome, report, run_episodes
@@ -145,3 +146,16 @@ def test_an_arm_that_does_not_follow_ends_the_run_and_says_why():
         assert "panda_joint2" in outcome.stopped
         assert session.state is State.FAULT
         assert session.trips[0]["stop_category"] == 1
+
+
+def test_the_scene_is_set_right_before_every_episode():
+    step = {"tool": [0.5, 0.0, 0.45]}
+    task = load_task("reach").model_copy(update={"steps": 5, "reset": parse([step])})
+    with LockstepSession(load_robot("panda"), "sim", reset=task.reset) as session:
+        outcome = Outcome()
+        run_episodes(session, InlineActor(session, task, "scripted", 0), task, 2, 0, outcome)
+        states = [event["state"] for event in session.link.events.since(0)[0] if event["type"] == "state"]
+    assert outcome.stopped == ""
+    between = "-".join(states).split("RUN")
+    # Home, scene, home; after the first episode home, scene, home; after the last one only parking.
+    assert [part.count("RESET") for part in between] == [3, 3, 1]
