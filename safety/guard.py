@@ -16,6 +16,8 @@ from robotctl.safety.machine import ENABLED, State
 from robotctl.safety.trip import Protection
 from robotctl.safety.wire_guard import WireGuard
 
+_LONGEST = 26
+"""Periods that a motion may make up for: as many as the loop does after a gap, and its own."""
 _WINDOW_NS = 250_000_000
 _SURPLUS = 1.5
 """Motion messages may come at this multiple of the servo rate, counted over a window ..."""
@@ -60,7 +62,8 @@ class Guard:
         self._measured = [(math.nan, math.nan)] * robot.dof
         self._now_ns: int | None = None
         self._time_ns = 0
-        """Wall time that the next motion has had: since the last one, and up to a period that that one left over."""
+        """Wall time that the next motion has: since the last one, and up to a period that that one left over."""
+        self._passed = False
         self._window_ns = 0
         self._cycles = [0] * robot.dof
         self._refusal: Refusal | None = None
@@ -69,12 +72,16 @@ class Guard:
         """Begin a tick, at `now_ns`, so much later than it was due; `sample` is what was measured."""
         self._measured = list(zip(sample.position.tolist(), sample.velocity.tolist(), strict=True))
         period = self._period_ns
+        if self._passed:
+            self._time_ns = min(max(self._time_ns - period, 0), period)
+            self._passed = False
         since = period + min(late_ns, period) if self._now_ns is None else now_ns - self._now_ns
-        self._time_ns = min(max(self._time_ns - period, 0), period) + since
+        self._time_ns = min(self._time_ns + since, _LONGEST * period)
         self._now_ns = now_ns
         if now_ns - self._window_ns >= _WINDOW_NS:
             self._window_ns, self._cycles = now_ns, [0] * len(self._cycles)
         if self._state() not in ENABLED:
+            self._time_ns = period
             for joint in self._joints:
                 joint.forget()
 
@@ -143,6 +150,7 @@ class Guard:
             return self._refuse(Refusal(Protection.TORQUE, f"a power of {power:.0f} W, {self._power:g} W are allowed"))
         for index, asked, _ in motions:
             self._joints[index].keep(asked)
+        self._passed = True
         return ""
 
     def _refuse(self, refusal: Refusal) -> str:

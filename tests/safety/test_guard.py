@@ -28,6 +28,7 @@ from robotctl.safety.trip import Protection
 
 PANDA = load_robot("panda")
 HOME = np.array(PANDA.profile.home)
+SAFETY = PANDA.profile.safety
 REST = np.zeros(7)
 PERIOD = PANDA.period_ns
 MS = 1_000_000
@@ -230,7 +231,6 @@ def standing(late=0):
 def test_a_tick_has_one_period():
     assert steps(standing().tick(), 1.0) is None
     assert steps(standing().tick(), 1.01) is Protection.ACCELERATION
-    assert steps(standing().tick().tick(), 1.01) is Protection.ACCELERATION
 
 
 def test_a_second_command_in_the_same_tick_has_no_more_time():
@@ -245,21 +245,46 @@ def test_after_skipped_periods_there_is_time_for_them():
     assert steps(standing().tick(5 * PERIOD), 5.1) is Protection.ACCELERATION
 
 
-def test_time_that_a_late_tick_left_over_counts_up_to_one_period():
-    late = standing().tick(round(1.75 * PERIOD))
-    assert steps(late, 1.0) is None
-    assert late.tick(round(0.25 * PERIOD)).command(velocity=2.0 * 2e-3 * PANDA.limits.acceleration) is None
-    late = standing().tick(round(1.75 * PERIOD)).tick(round(0.25 * PERIOD))
-    assert steps(late, 1.01) is Protection.ACCELERATION
-    idle = standing().tick(20 * PERIOD).tick()
-    assert steps(idle, 2.0) is None
-    idle = standing().tick(20 * PERIOD).tick()
-    assert steps(idle, 2.01) is Protection.ACCELERATION
+def stand(bench, ticks):
+    """Ask for no motion after ticks of these lengths, in periods."""
+    for periods in ticks:
+        assert bench.tick(round(periods * PERIOD)).command() is None
+    return bench
 
 
-def test_time_left_over_is_used_up_by_the_next_tick_on_time():
-    bench = standing().tick(round(1.5 * PERIOD)).tick(round(0.5 * PERIOD)).tick()
-    assert steps(bench, 1.01) is Protection.ACCELERATION
+@pytest.mark.parametrize(("ticks", "most"), [
+    ([1.0], 1.0), ([1.75], 1.75), ([1.5, 0.5], 1.0), ([2.0], 2.0), ([20.0], 2.0), ([20.0, 1.0], 2.0), ([1.0, 0.5, 0.75], 1.0),
+])  # fmt: skip
+def test_time_that_a_tick_left_over_counts_up_to_one_period(ticks, most):
+    assert steps(stand(standing(), ticks).tick(), most) is None
+    assert steps(stand(standing(), ticks).tick(), most + 0.01) is Protection.ACCELERATION
+
+
+def test_while_nothing_leaves_time_adds_up_to_what_the_loop_makes_up_for():
+    assert steps(standing().tick().tick().tick(), 3.0) is None
+    assert steps(standing().tick().tick().tick(), 3.01) is Protection.ACCELERATION
+    for ticks, most in ((26, 26.0), (60, 26.0)):
+        bench = standing()
+        for _ in range(ticks):
+            bench.tick()
+        assert steps(bench, most) is None
+        bench = standing()
+        for _ in range(ticks):
+            bench.tick()
+        assert steps(bench, most + 0.1) is Protection.ACCELERATION
+
+
+def test_with_the_drives_off_no_time_adds_up():
+    bench = Bench(State.READY).tick().tick().tick()
+    bench.state = State.ARMED
+    way = SAFETY.bump + PANDA.limits.velocity[0] * 2e-3 * 2
+    elsewhere = HOME.copy()
+    elsewhere[0] += way - 1e-4
+    assert bench.tick().command(position=elsewhere) is None
+    bench = Bench(State.READY).tick().tick().tick()
+    bench.state = State.ARMED
+    elsewhere[0] = HOME[0] + way + 1e-3
+    assert bench.tick().command(position=elsewhere) is Protection.BUMP
 
 
 @pytest.mark.parametrize(("late", "most"), [(0, 0.5), (PERIOD // 4, 0.75), (PERIOD // 2, 1.0), (10 * PERIOD, 1.5)])
