@@ -253,7 +253,8 @@ def stand(bench, ticks):
 
 
 @pytest.mark.parametrize(("ticks", "most"), [
-    ([1.0], 1.0), ([1.75], 1.75), ([1.5, 0.5], 1.0), ([2.0], 2.0), ([20.0], 2.0), ([20.0, 1.0], 2.0), ([1.0, 0.5, 0.75], 1.0),
+    ([1.0], 1.0), ([1.75], 1.75), ([1.5, 0.5], 1.0), ([2.0], 2.0),
+    ([20.0], 2.0), ([20.0, 1.0], 2.0), ([1.0, 0.5, 0.75], 1.0),
 ])  # fmt: skip
 def test_time_that_a_tick_left_over_counts_up_to_one_period(ticks, most):
     assert steps(stand(standing(), ticks).tick(), most) is None
