@@ -25,7 +25,7 @@ import ruckig  # noqa: F401
 import robotctl.hal.robot  # noqa: F401
 
 from . import campaign
-from .campaign import Case, Package, Survey
+from .campaign import SURVIVORS, Case, Package, Survey
 from .report import EXCUSED, report
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +56,9 @@ def main() -> int:
             done = []
             for case in campaign.run(package, seen, todo, options.jobs):
                 done.append(case)
-                if len(done) % 100 == 0:
+                if case.fate in SURVIVORS:
+                    print(f"{case.id} {case.fate}", flush=True)
+                elif len(done) % 100 == 0:
                     print(f"{len(done)} of {len(todo)}", flush=True)
     except campaign.UnmutatedTestsFail:
         print("the tests fail on the unchanged modules; look with: python -m pytest tests/safety", file=sys.stderr)

@@ -34,6 +34,7 @@ import pytest
 from .mutants import Mutant, Place, find, watch
 
 FATES = KILLED, TIMED_OUT, NOT_COVERED, SURVIVED = "killed", "timed out", "not covered", "survived"
+SURVIVORS = NOT_COVERED, SURVIVED
 _ALLOWANCE_S = 3.0
 _SLOWER = 10.0
 """A test may take so many times its usual time, and the allowance, before its mutant counts as hanging."""

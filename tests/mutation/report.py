@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .campaign import FATES, NOT_COVERED, SURVIVED, Case
+from .campaign import FATES, SURVIVORS, Case
 
 MOST_EXCUSED = 3
 
@@ -27,7 +27,7 @@ EXCUSED: tuple[Excuse, ...] = ()
 
 def report(done: Sequence[Case], excuses: Sequence[Excuse], seconds: float, path: Path | None = None) -> int:
     """Print survivors and figures, write them to `path`; return the exit status, 0 or 1."""
-    survivors = [case for case in done if case.fate in (SURVIVED, NOT_COVERED)]
+    survivors = [case for case in done if case.fate in SURVIVORS]
     survivors.sort(key=lambda case: (case.file, case.mutant.line, case.id))
     excused = {
         case.id: e for case in survivors for e in excuses if e[:3] == (case.file, case.source, case.mutant.change)

@@ -222,7 +222,8 @@ def test_a_row_that_no_solver_answers_for_ends_in_braking(monkeypatch):
     monkeypatch.setattr("robotctl.safety.shaper.daqp.solve", fails)
     velocity = along(0.6, brake * dt * [0.0, 3.0, -3.0, 0.5, -0.5, 0.0, 0.0])
     shaped = step(robot, at(room(robot, 0.0) - 0.05), velocity, velocity)
-    assert len(answers) == 2
+    # Tried with firm rows, then with rows that daqp may soften (8), but never the caps.
+    assert [senses.tolist() for *_, senses in answers] == [8 * [0], 7 * [0] + [8]]
     assert shaped.velocity == pytest.approx(Shaper(robot, Slide()).brake(velocity), abs=1e-8)
 
 
