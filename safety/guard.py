@@ -43,6 +43,8 @@ PERMITTED: dict[Kind, frozenset[State]] = {
 }
 """The states in which each kind of message may leave."""
 
+_RATED = ENABLED - {State.STOPPING}
+"""The states in which motions are counted: a stop is never kept back because of what came before it."""
 _STANDING = frozenset({State.ARMED, State.HOLD})
 
 
@@ -139,7 +141,7 @@ class Guard:
             if state not in PERMITTED[asked.kind]:
                 return self._permit(asked.kind)
             self._cycles[index] += 1
-            if self._cycles[index] > self._most:
+            if self._cycles[index] > self._most and state in _RATED:
                 return self._refuse(Refusal(Protection.FRAMES, f"more than {self._most} motions within 0.25 s"))
             position, velocity = self._measured[index]
             refusal = self._joints[index].refuse(asked, step, position, velocity, seconds, standing=standing)

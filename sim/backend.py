@@ -57,6 +57,8 @@ class SimArm(Arm):
         self._connected = False
         self._enabled = False
         self._inspector: Inspector | None = None
+        self.blocked = ""
+        """Why no command reaches the drives at present."""
         self._timeout_ns = round(WATCHDOG_SHARE * robot.profile.safety.drive_timeout_s * 1e9)
         self._fed_ns = 0
         self._faults: tuple[Fault, ...] = ()
@@ -150,6 +152,8 @@ class SimArm(Arm):
         refusal = self._inspector.command(command) if self._inspector else ""
         if refusal:
             return Sent(command, f"not sent: {refusal}", delivered=False)
+        if self.blocked:
+            return Sent(command, f"not sent: {self.blocked}", delivered=False)
         self._fed_ns = self._clock.now_ns()
         if self._delay_ns:
             self._waiting.append((self._fed_ns + self._delay_ns, command))

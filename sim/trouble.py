@@ -172,19 +172,6 @@ class Report(Trouble):
 # -- what reaches the arm ---------------------------------------------------------------------------------------------
 
 
-class Lose(Trouble):
-    """Commands are lost. The loop is told so, unless they vanish silently."""
-
-    def __init__(self, *, silently: bool = False) -> None:
-        self._silently = silently
-
-    def on_write(self, command: Command) -> Command | Sent:
-        self.acted += 1
-        if self._silently:
-            return Sent(command)
-        return Sent(command, "not sent: the transmit queue is full", delivered=False)
-
-
 class Garble(Trouble):
     """Some commands are altered on their way to the arm, as by a bug of whatever made them."""
 

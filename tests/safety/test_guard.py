@@ -308,6 +308,16 @@ def test_the_number_of_motions_within_a_quarter_of_a_second_is_bounded():
     assert bench.tick(249 * MS).frames(joint_frame(3)) is Protection.FRAMES
 
 
+@pytest.mark.parametrize("state", [State.STOPPING, State.DISABLED, State.FAULT])
+def test_a_stop_is_never_too_often(state):
+    bench = Bench()
+    while bench.frames(joint_frame(3)) is None:
+        pass
+    bench.state = state
+    for _ in range(1000):
+        assert bench.frames(joint_frame(3, kp=0.0)) is None
+
+
 def test_taking_torque_away_is_never_too_often():
     bench = Bench()
     for _ in range(1000):

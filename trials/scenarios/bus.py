@@ -12,7 +12,7 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Fault, Sample
 from robotctl.safety.trip import Category, Protection
 from robotctl.sim.motors import trouble as wire
-from robotctl.sim.trouble import Lose, Misread, NoWatchdog, Reject, Report, Trouble
+from robotctl.sim.trouble import Misread, NoWatchdog, Reject, Report, Trouble
 from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
 from robotctl.trials.faults import Planted, between, misread, on_wire
@@ -60,23 +60,23 @@ def _bus_off(bench: Bench) -> Planted:
 def _queue_full(bench: Bench) -> Planted:
     """Nothing leaves the host for a while, and the loop is told so; the drives' watchdogs have not bitten yet."""
     ends = bench.now_ns + _FULL_NS
-    if bench.bus is None:
-        lost = Lose()
-        planted = between(bench, lost)
-    else:
-        _fail(bench, errno.ENOBUFS)
-        planted = between(bench, Trouble())
+    _block(bench, blocked=True)
 
     class Ending(Trouble):
         def on_read(self, sample: Sample) -> Sample:
             if bench.now_ns >= ends and not self.acted:
                 self.acted += 1
-                planted.undo()
-                if bench.bus is not None:
-                    bench.bus.failure = None
+                _block(bench, blocked=False)
             return sample
 
     return between(bench, Ending())
+
+
+def _block(bench: Bench, *, blocked: bool) -> None:
+    if bench.twin:
+        bench.twin.blocked = "the transmit queue is full" if blocked else ""
+    elif bench.bus:
+        bench.bus.failure = can.CanOperationError("a test", errno.ENOBUFS) if blocked else None
 
 
 def _fail(bench: Bench, number: int) -> None:
@@ -89,7 +89,7 @@ def _unplugged(bench: Bench) -> None:
 
 
 def _blocked(bench: Bench) -> None:
-    _fail(bench, errno.ENOBUFS)
+    _block(bench, blocked=True)
 
 
 def _no_sense(bench: Bench) -> Planted:
@@ -152,8 +152,8 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     senseless = Expected(
         protection=Protection.RECEIVE, category=Category.BRAKE_OFF, within_s=safety.rejected_frames * period
     )
-    if backend == "can":  # what is not believed of the drives leaves nothing to damp the arm by
-        senseless = senseless.losing_torque(robot)
+    # What is not believed of a joint leaves nothing to damp the arm by.
+    unknown = senseless.losing_torque(robot)
     found = [
         refusal_scenario(13, "no watchdog", "a drive has no watchdog", _timeout_of(0.0), ["watchdog"], 3),
         orphan_scenario(13, "loop gone", "the loop is not heard of any more"),
@@ -161,11 +161,13 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
             14, "bus-off", "the controller leaves the bus", _bus_off, on_bus if backend == "sim" else unheard
         ),
         stop_scenario(14, "queue full", "nothing leaves the host for 40 ms", _queue_full, coasting),
-        stop_scenario(15, "senseless", "answers of a wrong length", _no_sense, senseless),
-        stop_scenario(15, "jump", "an encoder jumps by 0.5 rad", _jumped, senseless),
+        stop_scenario(
+            15, "senseless", "answers of a wrong length", _no_sense, senseless if backend == "sim" else unknown
+        ),
+        stop_scenario(15, "jump", "an encoder jumps by 0.5 rad", _jumped, unknown),
     ]
     if backend == "sim":
-        return [*found, stop_scenario(15, "no number", "an angle is no number", _no_number, senseless)]
+        return [*found, stop_scenario(15, "no number", "an angle is no number", _no_number, unknown)]
     too_long = 2.0 * safety.drive_timeout_s
     sooner_or_later = Expected(
         protection=Protection.RECEIVE,

@@ -165,7 +165,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         led_away,
         excused=frozenset({"velocity", "position", "sphere"}),
         or_else=((Protection.OVERSPEED, Category.BRAKE_OFF), (Protection.OVERSPEED, Category.CUT)),
-    )
+    ).losing_torque(robot)
     overspeed = replace(
         led_away,
         protection=Protection.OVERSPEED,

@@ -28,7 +28,8 @@ _GAP = 0.05
 _FARTHEST = 0.4
 _TOLERANCE = 2e-3
 """By how much the true clearance may fall short of `proximity_stop`, m."""
-_STEP = 2e-3
+_STEP = 5e-4
+_BESIDE = 1e-3
 _PULL_S = 0.4
 
 
@@ -94,8 +95,8 @@ def _approach(bench: Bench) -> Act:
 
 
 def _close_by(bench: Bench) -> None:
-    slow = bench.robot.profile.safety.proximity_slow
-    bench.place(_obstacle(str(bench.robot.source)).near(slow))
+    safety = bench.robot.profile.safety
+    bench.place(_obstacle(str(bench.robot.source)).near(safety.proximity_stop + safety.proximity_margin + _BESIDE))
     still(bench)
 
 
