@@ -11,6 +11,8 @@ from robotctl.hal.host import Finding, Level
 from robotctl.hal.profile import Drive
 from robotctl.hal.robot import Robot
 
+_TAKE_OVER_S = 0.02
+"""What the watchman needs to notice, to open a channel and to send."""
 _COMFORTABLE_LOAD = 0.75
 """Bus load above which retransmissions and register traffic find no room."""
 
@@ -43,7 +45,19 @@ def profile_findings(robot: Robot) -> list[Finding]:
     kind = "CAN FD" if wire.fd else "classic CAN"
     text = f"{count} drives at {profile.servo_hz} Hz on {kind} load the bus by {load * 100:.0f} %"
     remedy = f"servo_hz of at most {int(_COMFORTABLE_LOAD / cycle_s)}, or a second bus"
-    return [*findings, _finding("profile", "bus load", level, text, remedy)]
+    findings.append(_finding("profile", "bus load", level, text, remedy))
+    return [*findings, _watchman_finding(robot)]
+
+
+def _watchman_finding(robot: Robot) -> Finding:
+    safety = robot.profile.safety
+    in_time = safety.watchman_s + _TAKE_OVER_S <= safety.drive_timeout_s
+    text = (
+        f"takes the drives {safety.watchman_s * 1e3:g} ms after the loop's last tick; they may go off by themselves "
+        f"after {safety.drive_timeout_s * 1e3:g} ms"
+    )
+    remedy = f"safety.watchman_s of at most {safety.drive_timeout_s - _TAKE_OVER_S:g}, or the arm falls before"
+    return _finding("profile", "watchman", Level.OK if in_time else Level.WARN, text, remedy)
 
 
 def drive_findings(robot: Robot, found: Scan) -> list[Finding]:
@@ -89,6 +103,9 @@ def _problems(robot: Robot, drive: Drive, mode: ControlMode, motor: FoundMotor, 
         text = f"watchdog {identity.timeout_s * 1e3:g} ms" if identity.timeout_s else "no watchdog"
         remedy = f"set register {Register.TIMEOUT} (TIMEOUT, 50 us a count) to {round(longest / 50e-6)} and save it"
         yield _finding("drives", who, Level.FAIL, text, remedy)
+    elif identity.timeout_s < robot.profile.safety.watchman_s + _TAKE_OVER_S:
+        text = f"watchdog {identity.timeout_s * 1e3:g} ms: it goes off before the watchman can take it"
+        yield _finding("drives", who, Level.WARN, text, "raise its register TIMEOUT, or lower safety.watchman_s")
     if motor.status not in (status_name(0), status_name(1)):
         yield _finding("drives", who, Level.FAIL, f"reports {motor.status}", "remove the cause, then clear the fault")
     if identity.mode != mode:

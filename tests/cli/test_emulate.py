@@ -17,6 +17,8 @@ from robotctl.cli.main import app
         (["--trouble", "mute:99"], 2),
         (["--register", "1:9=x"], 2),
         (["--channel", "socketcan:robotctl9"], 4),
+        (["--log", "bus.nonsense"], 2),
+        (["--log", "/nowhere/bus.log"], 2),
     ],
 )
 def test_what_cannot_be_done_says_what_to_try(options: list[str], status: int) -> None:

@@ -125,6 +125,17 @@ def test_drives_stand_still_while_the_server_does_not_run(panda: Robot) -> None:
     assert [reply.data[0] >> 4 for reply in port.outgoing] == [Status.ENABLED] * 2
 
 
+def test_whoever_listens_hears_both_directions_in_the_drives_own_time(panda: Robot) -> None:
+    clock, port = VirtualClock(), Stub()
+    server = Server(Bench(panda, fd=False), port, clock)
+    heard: list[tuple[float, int]] = []
+    server.on_frame = lambda seen: heard.append((seen.timestamp, seen.arbitration_id))
+    clock.sleep_until(5 * MS)
+    port.incoming = [frame(1)]
+    server.step()
+    assert heard == [(0.005, 1), (0.005, 0x11)]
+
+
 def test_fd_replies_are_lost_on_a_classic_port(panda: Robot) -> None:
     port = Stub(fd=False)
     server = Server(Bench(panda, fd=True), port, VirtualClock())

@@ -30,6 +30,7 @@ def test_healthy_drives_are_fine(bench):
         (lambda m: setattr(m, "status", 0xE), Level.FAIL, "OVERLOAD"),
         (lambda m: m.registers.update({Register.TIMEOUT: 0}), Level.FAIL, "no watchdog"),
         (lambda m: m.registers.update({Register.TIMEOUT: 8000}), Level.FAIL, "400 ms"),
+        (lambda m: m.registers.update({Register.TIMEOUT: 1399}), Level.WARN, "before the watchman"),
         (lambda m: m.registers.update({Register.VMAX: 8.0}), Level.FAIL, "ranges"),
         (lambda m: m.registers.update({Register.CTRL_MODE: 2}), Level.WARN, "control mode 2"),
     ],
@@ -72,3 +73,11 @@ def test_a_profile_without_drives_is_only_a_warning():
 def test_a_sphere_gain_too_high_for_the_lag():
     robot = load_robot("panda", ["twin.lag_s=0.1"])
     assert any(finding.name == "sphere_gain" and "2.50" in finding.remedy for finding in profile_findings(robot))
+
+
+@pytest.mark.parametrize(("patience", "level"), [("0.08", Level.OK), ("0.081", Level.WARN)])
+def test_a_watchman_that_comes_after_the_drives_own_watchdogs_is_warned_of(patience, level):
+    robot = load_robot("openarm", [f"safety.watchman_s={patience}"])
+    (finding,) = [finding for finding in profile_findings(robot) if finding.name == "watchman"]
+    assert finding.level is level
+    assert bool(finding.remedy) is (level is Level.WARN)
