@@ -142,24 +142,54 @@ def test_pairs_that_are_too_near_are_led_apart_but_not_fast(distance: float, bou
     assert same(row, [1.0, 0.0], bound)
 
 
-def test_a_path_keeps_what_is_required_at_all_of_its_poses() -> None:
-    keeps = STOP + MARGIN
+@pytest.mark.parametrize("which", range(3))
+def test_a_path_keeps_what_is_required_at_all_of_its_poses(which: int) -> None:
     watched = limit()
     _, required = watched.look(np.zeros(2))
-    assert required == pytest.approx(np.full(3, keeps), abs=3e-5)
-    for last in (True, False):
-        for distance, expected in ((keeps + 1e-6, True), (keeps, True), (keeps - 1e-4, False), (-0.5, False)):
-            path = np.array([[0.0, 0.0], [0.1 - distance, 0.0]])
-            assert watched.keeps(path if last else path[::-1], required) is expected
+    assert required == pytest.approx(np.full(3, KEEPS), abs=3e-5)
+    for distance, expected in ((KEEPS + 1e-6, True), (KEEPS, True), (KEEPS - 1e-4, False), (-0.5, False)):
+        path = np.full((3, 2), [0.1 - KEEPS, 0.0])  # all other poses are as near as may be
+        path[which, 0] = 0.1 - distance
+        assert watched.keeps(path, required) is expected
+
+
+@pytest.mark.parametrize(("room", "travel", "expected"), [(0.0, 0.0019, True), (0.0, 0.0021, False)])
+@pytest.mark.parametrize("spare", [0.0, 0.01])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_between_two_poses_a_pair_may_fall_a_millimetre_short(room, travel, expected, spare, reverse) -> None:
+    """The third pair is as near at both, but might be nearer in between by half of what it can move."""
+    watched = limit(1)
+    required = np.full(3, KEEPS)
+    middle = np.full(2, 0.3 - KEEPS - room - spare)
+    apart = (travel + 2.0 * spare) * np.array([0.5, -0.5])
+    scene = watched._scene
+    scene.offsets = np.array([9.0, 9.0, 0.3])
+    path = np.array([middle - apart, middle + apart])
+    path = path[::-1] if reverse else path
+    assert scene.measure(path[0], [2]) == pytest.approx(KEEPS + room + spare)
+    assert np.abs(np.diff(path, axis=0)) @ scene.reach[2] == pytest.approx(travel + 2.0 * spare)
+    assert watched.keeps(path, required) is expected
+    scene.measured.clear()
+    watched.keeps(path, required)
+    assert scene.measured == ([] if expected else [2, 2])
 
 
 def test_a_pair_that_is_too_near_may_get_no_nearer() -> None:
     watched = limit(1)
-    _, required = watched.look(np.array([0.098, 0.0]))
-    assert required == pytest.approx([0.002, STOP + MARGIN, STOP + MARGIN], abs=3e-5)
-    assert watched.keeps(np.array([[0.098, 0.0]]), required)
-    assert watched.keeps(np.array([[0.090, 0.0]]), required)
-    assert not watched.keeps(np.array([[0.0981, 0.0]]), required)
+    here = np.array([0.098, 0.0])
+    _, required = watched.look(here)
+    assert required == pytest.approx([0.002, KEEPS, KEEPS], abs=3e-5)
+    assert watched.keeps(np.array([here, here]), required)
+    assert watched.keeps(np.array([here, [0.097, 0.0]]), required)
+    assert not watched.keeps(np.array([here, [0.0981, 0.0]]), required)
+
+
+@pytest.mark.parametrize(("left", "expected"), [(1e-9, True), (-1e-9, False)])
+def test_a_way_that_is_short_enough_is_clear_wherever_it_leads(left: float, expected: bool) -> None:
+    watched, required = limit(), np.array([0.01, 0.02, 0.03])
+    position, way = np.array([0.02, -0.01]), np.array([0.03, 0.01])
+    watched._scene.offsets = required + np.abs(Lines.slopes) @ way + Lines.slopes @ position + [1.0, left, 1.0]
+    assert watched.clear(position, way, required) is expected
 
 
 def test_nothing_is_near_where_there_is_no_geometry(panda: Robot) -> None:
@@ -167,7 +197,8 @@ def test_nothing_is_near_where_there_is_no_geometry(panda: Robot) -> None:
     watched = ProximityLimit(panda, scene, 4)
     rows, required = watched.look(np.zeros(7))
     assert rows == []
-    assert watched.keeps(np.full((4, 7), 3.0), required)
+    assert watched.clear(np.zeros(7), np.ones(7), required)
+    assert watched.keeps(np.full((5, 7), 3.0), required)
     assert ProximityBreach(panda, scene).check(np.zeros(7), STAMP) is None
     assert len(scene.measure(np.zeros(7), range(0))) == len(scene.approach(np.zeros(7), range(0))) == 0
 
@@ -324,23 +355,46 @@ def test_links_that_are_not_near_are_not_slowed() -> None:
     assert Clip.PROXIMITY in step(shaper(Narrow([SLOW - 1e-6, 1.0])), fast, fast).clip
 
 
+SLUGGISH = "joints.0.acceleration=0.2"
+"""Now the way to rest is long, and matters before the row does."""
+
+
+def way_to_rest(speed: float) -> tuple[float, float]:
+    """Braking of the first joint, and its way from the beginning of a step at constant speed."""
+    brake = (1.0 - a_robot().profile.safety.cap_margin) * 0.2
+    return brake, 0.002 * speed + speed**2 / (2.0 * brake)
+
+
 @pytest.mark.parametrize(("left", "brakes"), [(-1e-5, False), (-3e-5, True)])
 def test_a_step_from_which_links_would_stop_too_near_is_not_made(left: float, brakes: bool) -> None:
-    """Half of the difference is what measurements may differ by."""
-    sluggish = "joints.0.acceleration=0.2"
-    speed, brake = 0.3, (1.0 - a_robot().profile.safety.cap_margin) * 0.2
-    way = 0.002 * speed + speed**2 / (2.0 * brake)
-    scene = Narrow([KEEPS + way + left, 1.0])
-    shaped = step(shaper(scene, sluggish), along(speed), along(speed))
+    """Between the two lies what measurements may differ by."""
+    brake, way = way_to_rest(0.3)
+    shaped = step(shaper(Narrow([KEEPS + way + left, 1.0]), SLUGGISH), along(0.3), along(0.3))
     assert shaped.clip is (Clip.PREDICTED_STOP if brakes else Clip.NONE)
-    assert shaped.velocity[0] == pytest.approx(speed - brake * 0.002 if brakes else speed)
-    # What was looked at: where the arm is, and four poses on its way to rest.
-    ahead = [pose[0] - HOME[0] for pose in scene.asked]
-    expected = [0.0, *(0.002 * speed + (way - 0.002 * speed) * (2.0 * share - share**2) for share in SHARES)]
-    assert ahead == pytest.approx(expected)
+    assert shaped.velocity[0] == pytest.approx(0.3 - brake * 0.002 if brakes else 0.3)
 
 
-SHARES = (0.25, 0.5, 0.75, 1.0)
+@pytest.mark.parametrize(("left", "brakes"), [(-1e-5, False), (-3e-5, True)])
+def test_where_any_way_of_that_length_would_be_too_long_the_way_to_rest_is_looked_at(left, brakes) -> None:
+    """The pair could come together twice as fast as it does."""
+    brake, way = way_to_rest(0.2)
+    scene = Narrow([KEEPS + way + left, 1.0])
+    scene.reach = 2.0 * scene.reach
+    shaped = step(shaper(scene, SLUGGISH), along(0.2), along(0.2))
+    assert shaped.clip is (Clip.PREDICTED_STOP if brakes else Clip.NONE)
+    assert shaped.velocity[0] == pytest.approx(0.2 - brake * 0.002 if brakes else 0.2)
+    ahead = {round(float(pose[0] - HOME[0]), 9) for pose in scene.asked}
+    shares = np.arange(9) / 8.0
+    expected = np.where(shares > 0.0, 0.0004 + (way - 0.0004) * (2.0 * shares - shares**2), 0.0)
+    assert ahead == {round(float(value), 9) for value in expected}
+
+
+def test_no_pair_is_measured_again_while_it_has_enough_to_spare() -> None:
+    scene = Narrow([0.5, 1.0])
+    shapes = shaper(scene)
+    for _ in range(5):
+        assert step(shapes, along(0.2), along(0.2)).clip is Clip.NONE
+    assert len(scene.asked) == 1
 
 
 @pytest.mark.parametrize(("clearance", "back"), [(0.006, 0.01), (0.0, 0.04), (-0.002, 0.05), (-0.5, 0.05)])
