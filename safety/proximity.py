@@ -21,6 +21,8 @@ from robotctl.safety.trip import Category, Protection, Trip
 
 _ROUNDING = 2e-5
 """By how much two measurements of one clearance may differ, m."""
+_BETWEEN = 1e-3
+"""By how much clearance may fall short between two poses that are looked at, m."""
 
 
 class Scene(Protocol):
@@ -87,30 +89,48 @@ class ProximityLimit:
     def __init__(self, robot: Robot, scene: Scene, samples: int) -> None:
         """Watch a reference, and `samples` poses on its way to rest."""
         safety = robot.profile.safety
-        self.stop = safety.proximity_stop + safety.proximity_margin
+        self._stop = safety.proximity_stop + safety.proximity_margin
         self._slow = safety.proximity_slow
         self._gain = safety.sphere_gain
         self._scene = scene
+        self._fade = scene.reach.T.copy()
         self._here = Clearances(scene, 1)
-        self._ahead = Clearances(scene, samples)
+        self._ahead = Clearances(scene, 1 + samples)
 
     def look(self, position: Vector) -> tuple[list[Row], Vector]:
         """Return the rows of the pairs that are near, and what clearance each pair has to keep from here on (m,), m.
 
-        A pair that is too close already may get no closer.
+        A pair that is too near already may get no nearer.
         """
         clearances = self._here.at(position[np.newaxis], self._slow)[0]
         near = np.flatnonzero(clearances < self._slow).tolist()
         slopes = self._scene.approach(position, near) if near else ()
         rows = [
-            Row.keeping(clearances[pair] - self.stop, self._gain, slope)
+            Row.keeping(clearances[pair] - self._stop, self._gain, slope)
             for pair, slope in zip(near, slopes, strict=True)
         ]
-        return rows, np.minimum(clearances, self.stop) - _ROUNDING
+        return rows, np.minimum(clearances, self._stop) - _ROUNDING
+
+    def clear(self, position: Vector, way: Vector, required: Vector) -> bool:
+        """Return whether no way that moves no joint further than `way` (n,) can take a pair its required clearance."""
+        enough = required + way @ self._fade
+        return bool((self._here.at(position[np.newaxis], enough)[0] >= enough).all())
 
     def keeps(self, path: Vector, required: Vector) -> bool:
-        """Return whether every pair has its required clearance (m,) at all poses of a path (samples, n)."""
-        return bool((self._ahead.at(path, required) >= required).all())
+        """Return whether every pair keeps its required clearance (m,) all along a path (1 + samples, n).
+
+        Between two poses a pair has at least the mean of its clearances there less half of what it can move by.
+        """
+        travel = np.abs(np.diff(path, axis=0)) @ self._fade
+        enough = np.full((len(path), len(required)), required)
+        between = required - _BETWEEN
+        np.maximum(enough[1:], between + 0.5 * travel, out=enough[1:])
+        np.maximum(enough[:-1], between + 0.5 * travel, out=enough[:-1])
+        clearances = self._ahead.at(path, enough)
+        if (clearances >= enough).all():
+            return True
+        means = 0.5 * (clearances[1:] + clearances[:-1] - travel)
+        return bool((clearances >= required).all() and (means >= between).all())
 
 
 class ProximityBreach:

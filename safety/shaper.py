@@ -29,8 +29,10 @@ _SOLVED = (1, 2)
 """daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
 
 
-_SAMPLES = np.array([[0.25], [0.5], [0.75], [1.0]])
-"""Where along the time to rest a predicted stop is looked at."""
+_SAMPLES = np.arange(1, 9)[:, np.newaxis] / 8
+"""Where along the time to rest links are looked at on a predicted stop ..."""
+_TOOL = slice(1, None, 2)
+"""... and which of these do for the tool, a point that no thin thing can come between."""
 _ROUNDING = 1e-9
 """m"""
 _SINGULAR = 1e-6
@@ -103,10 +105,10 @@ class Shaper:
         self._step = self.acceleration_cap * self._dt
         # A hair wider, so that the limiter's own full acceleration does not count as clipped for a rounding error.
         self._change = self._step * (1.0 + 1e-9)
-        # With these, speed @ reach bounds the tool's speed, and speed @ (step + braking * speed) its way to rest.
+        self._half_dt = 0.5 * self._dt
+        self._half_brake = 0.5 / self.acceleration_cap
+        # With this, speed @ reach bounds the tool's speed.
         self._reach = model.reach
-        self._reach_step = model.reach * self._dt
-        self._reach_braking = model.reach / (2.0 * self.acceleration_cap)
         self._hessian = np.eye(self._n)
         # Where braking within the acceleration caps cannot keep the rows, the rows give way, not the caps.
         firm = np.zeros(self._n + len(self.regions) + len(scene.pairs), dtype=np.int32)
@@ -224,15 +226,19 @@ class Shaper:
         The joints do not come to rest together, so the way is sampled in time, not between its ends. Already
         outside, the tool may get no further out.
         """
-        start = position + (0.5 * self._dt) * (velocity + following)
         speed = np.abs(following)
+        way = self._half_dt * (np.abs(velocity) + speed) + speed * speed * self._half_brake
+        reached = way @ self._reach
+        near = [(room, region) for room, region in rooms if room < reached]
+        clear = self._proximity.clear(position, way, required)
+        if clear and not near:
+            return True
         rest = np.maximum(speed / self.acceleration_cap, 1e-9)
         times = np.minimum(_SAMPLES * rest.max(), rest)
+        start = position + self._half_dt * (velocity + following)
         poses = start + following * times * (1.0 - 0.5 * times / rest)
-        way = speed @ (self._reach_step + self._reach_braking * speed)
-        near = [(room, region) for room, region in rooms if room < way]
         if near:
-            path = np.array([tool, *(self._tool(pose) for pose in poses)])
+            path = np.array([tool, *(self._tool(pose) for pose in poses[_TOOL])])
             if any(region.along(path) < min(0.0, room) - _ROUNDING for room, region in near):
                 return False
-        return self._proximity.keeps(poses, required)
+        return clear or self._proximity.keeps(np.concatenate([position[np.newaxis], poses]), required)

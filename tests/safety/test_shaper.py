@@ -185,28 +185,3 @@ def test_a_tool_outside_is_led_back(panda: Robot, kind: str) -> None:
     assert rooms[0] == pytest.approx(-0.02)
     assert rooms[-1] > -0.005
     assert min(np.diff(rooms)) > -1e-6
-
-
-def test_at_the_centre_of_the_sphere_the_other_rows_count(panda: Robot) -> None:
-    home = np.array(panda.profile.home)
-    x, y, z = (float(value) for value in Kinematics(panda).tool(home))
-    floor = f"keep_out=[{{kind: plane, name: floor, point: [0, 0, {z - 0.012}], normal: [0, 0, 1]}}]"
-    robot = load_robot("panda", [f"sphere.centre=[{x}, {y}, {z}]", floor, *without_acceleration_caps(panda)])
-    kinematics = Kinematics(robot)
-    shaper = Shaper(robot, kinematics)
-    tool, jacobian = kinematics.tool_and_jacobian(home)
-    assert shaper.regions[0].row(tool, jacobian) is None
-    shaped = shaper.step(home, np.zeros(7), 0.5 * np.sign(jacobian[2]) * -robot.limits.velocity, tool, jacobian)
-    assert shaped.clip == Clip.KEEP_OUT
-    assert jacobian[2] @ shaped.velocity == pytest.approx(-robot.profile.safety.sphere_gain * 0.010)
-
-
-def test_where_the_solver_fails_the_arm_brakes(panda: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    kinematics = Kinematics(panda)
-    shaper = Shaper(panda, kinematics)
-    monkeypatch.setattr("robotctl.safety.shaper.daqp.solve", lambda *arguments: (np.full(7, 99.0), 0.0, -4, {}))
-    pose = near_the_surface(panda, kinematics, 1)[0]
-    tool, jacobian = kinematics.tool_and_jacobian(pose)
-    velocity = 0.3 * np.sign(shaper.regions[0].row(tool, jacobian).normal)
-    shaped = shaper.step(pose, velocity, velocity, tool, jacobian)
-    assert shaped.velocity == pytest.approx(shaper.brake(velocity), abs=1e-9)
