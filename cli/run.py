@@ -17,13 +17,14 @@ from robotctl.cli.errors import Exit, hear_interrupts, readable_errors
 from robotctl.cli.keys import stop_keys
 from robotctl.cli.output import write_json
 from robotctl.control.acknowledgement import acknowledge, require_acknowledged
+from robotctl.control.deadman_device import DeadmanDevice
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.operator import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.recording_session import SessionRecording, record_session
 from robotctl.control.session import LockstepSession, Session
 from robotctl.hal.can.channel import may_be_real
-from robotctl.hal.errors import HardwareError
+from robotctl.hal.errors import ConfigError, HardwareError
 from robotctl.hal.profile import CLASSIC_HZ
 from robotctl.hal.robot import load_robot
 from robotctl.learning.actor import Actor, InlineActor, ProcessActor
@@ -50,6 +51,9 @@ def run(
         bool, typer.Option("--fast", help="Simulation in lockstep, as fast as the machine allows.")
     ] = False,
     record: Annotated[Path | None, typer.Option(help="MCAP file to write; default recordings/TIME-ROBOT.mcap.")] = None,
+    deadman: Annotated[
+        Path | None, typer.Option(help="Deadman's switch: /dev/input/js0, or what writes lines 0, 1, 2 (see the docs).")
+    ] = None,
     accept_limits: Annotated[
         bool, typer.Option("--accept-limits", help="Real drives: the limits are those that the arm should be held to.")
     ] = False,
@@ -72,6 +76,8 @@ def run(
         make_policy(policy, model, Kinematics(model), seed)  # complains here rather than in its process
         session: Session
         actor: Actor
+        if fast and deadman is not None:
+            raise ConfigError("nobody holds a switch in lockstep", "leave out --fast, or --deadman")
         if fast:
             session = LockstepSession(model, backend, channel, work.reset)
             actor = InlineActor(session, work, policy, seed)
@@ -79,6 +85,7 @@ def run(
             session = ProcessSession(model, backend, channel, overrides, work.reset)
             actor = ProcessActor(session, work, policy, seed, overrides)
         session.on_page = partial(_page, console)
+        session.on_switch = partial(console.print, "  hold the switch to start", style="bold")
         name = model.profile.name
         about = {"backend": backend, "robot": name, "task": work.name, "policy": policy, "seed": seed}
         about["limits_hash"] = model.limits_hash
@@ -87,7 +94,7 @@ def run(
             f"[bold]{model.profile.title}[/] on {backend}, task {work.name}, {episodes} episodes, seed {seed}"
         )
         real = may_be_real(channel)
-        job = Job(session, actor, work, episodes, seed, path, about, overrides, real, accept_limits)
+        job = Job(session, actor, work, episodes, seed, path, about, overrides, real, accept_limits, deadman)
         try:
             status, result, lost = _carry_out(job, console)
         except Terminated:  # before anything moved, or after everything had come to rest
@@ -116,6 +123,7 @@ class Job:
     real: bool
     """Whether the drives may be real ones."""
     accept_limits: bool
+    deadman: Path | None
 
 
 def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any], HardwareError | None]:
@@ -129,7 +137,7 @@ def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any], Hardwa
     lost: HardwareError | None = None
     recorded = record_session(session, job.path, job.about, on_trip, job.overrides)
     try:
-        with _terminable(), session:
+        with _terminable(), _switch(job), session:
             _look_at_limits(job)
             with recorded as recording, job.actor as actor:
                 recording.processes["policy"] = actor.pid
@@ -143,6 +151,16 @@ def _carry_out(job: Job, console: Console) -> tuple[Exit, dict[str, Any], Hardwa
     result["processes"] = recording.processes
     result["error"] = lost.what if lost is not None else ""
     return status, result, lost
+
+
+@contextmanager
+def _switch(job: Job) -> Iterator[None]:
+    """Read the deadman's switch, if there is one."""
+    if job.deadman is None:
+        yield
+    else:
+        with DeadmanDevice(job.deadman, job.session.link.desk.hold):
+            yield
 
 
 def _look_at_limits(job: Job) -> None:

@@ -111,6 +111,7 @@ class ProcessSession(Session):
             if time.monotonic() > deadline:
                 raise HardwareError("the control process did not come up", "run robotctl doctor")
             if self._watchman is not None and self._watchman.poll() is not None:
+                self._check()  # it ends with the control process, which then knows why
                 raise HardwareError("the watchman ended before anything had begun", "run robotctl doctor")
             time.sleep(0.01)
         self.poll()

@@ -18,6 +18,7 @@ from robotctl.hal.backend import BackendFactory, open_backend
 from robotctl.hal.clock import Clock, VirtualClock
 from robotctl.hal.errors import HardwareError, RobotctlError
 from robotctl.hal.robot import Robot
+from robotctl.safety.deadman import Grip
 from robotctl.safety.judge import Judge
 from robotctl.safety.machine import State
 from robotctl.safety.shaper import Clip
@@ -58,6 +59,8 @@ class Session(ABC):
         self.on_event: Callable[[dict[str, Any]], None] | None = None
         self.on_trip: Callable[[dict[str, Any]], None] | None = None
         self.on_page: Callable[[str], None] | None = None
+        self.on_switch: Callable[[], None] | None = None
+        """Called when something waits for the deadman's switch to be held."""
         self.on_poll: Callable[[], None] | None = None
         self._answers: dict[int, dict[str, Any]] = {}
         self._tick_cursor = 0
@@ -166,6 +169,22 @@ class Session(ABC):
         if not answer["ok"]:
             raise Stopped(answer["text"])
 
+    def await_switch(self) -> None:
+        """Wait until the deadman's switch is held, if there is one.
+
+        Raises:
+            Stopped: if it is unplugged.
+        """
+        desk = self.link.desk
+        if desk.grip in (Grip.NONE, Grip.HELD):
+            return
+        if self.on_switch is not None:
+            self.on_switch()
+        while desk.grip != Grip.HELD:
+            if desk.grip == Grip.UNPLUGGED:
+                raise Stopped("the deadman's switch is unplugged", "plug it in and start again")
+            self.advance(0.05)
+
     def wait_for(self, *states: State, timeout_s: float) -> State:
         """Return once the supervisor is in one of `states`.
 
@@ -192,6 +211,7 @@ class Session(ABC):
         Raises:
             Stopped: if it is refused, or ends in anything but ARMED.
         """
+        self.await_switch()
         self.request(routine, argument)
         self.wait_for(State.ARMED, timeout_s=_RESET_TIMEOUT_S)
 
@@ -205,6 +225,7 @@ class Session(ABC):
 
     def begin(self) -> None:
         """Hand the arm to the policy."""
+        self.await_switch()
         self.request(Verb.START)
 
     def end(self) -> None:

@@ -14,6 +14,7 @@ from robotctl.control.session import Session, Stopped
 from robotctl.hal.types import Vector
 from robotctl.learning.actor import Actor
 from robotctl.learning.task import ReachTask
+from robotctl.safety.deadman import Grip
 from robotctl.safety.machine import State
 from robotctl.safety.trip import Protection
 
@@ -121,8 +122,12 @@ def _may_continue(session: Session, state: State) -> bool:
     if state not in (State.STOPPING, State.HOLD) or not session.trips:
         return False
     trip = session.trips[-1]
+    if trip["protection"] == Protection.DEADMAN.label:  # it goes on as soon as the switch is held again
+        return session.link.desk.grip != Grip.UNPLUGGED
     grace_ns = session.robot.profile.safety.heartbeat_grace_s * 1e9
-    return bool(trip["protection"] == "P10" and session.clock.now_ns() - trip["stamp_ns"] < grace_ns)
+    return bool(
+        trip["protection"] == Protection.HEARTBEAT.label and session.clock.now_ns() - trip["stamp_ns"] < grace_ns
+    )
 
 
 def _reason(session: Session, actor: Actor) -> str:
