@@ -1,5 +1,6 @@
 """`robotctl bench`: what things cost, as ratios measured in one run."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -9,11 +10,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from robotctl.cli.errors import readable_errors
+from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.output import write_json
 from robotctl.control.benchmark import bench_tick
-from robotctl.hal.robot import Robot, load_robot
+from robotctl.hal.robot import Robot, load_robot, robot_names
 from robotctl.sim.plant import PHYSICS_STEP_NS, Plant
+from robotctl.trials.soak import cases, soak
 
 bench_app = typer.Typer(help="Measure what things cost.", no_args_is_help=True)
 
@@ -49,6 +51,49 @@ def tick(
             console.print(table)
         if json is not None:
             write_json(json, reports)
+
+
+@bench_app.command("soak")
+def soak_(
+    ticks: Annotated[
+        int, typer.Option(min=1000, help="Servo ticks, shared by all robots, modes and policies.")
+    ] = 10_000_000,
+    robot: Annotated[list[str] | None, typer.Option(help="Robots; by default all that are shipped.")] = None,
+    backend: Annotated[str, typer.Option(help="sim, or can for emulated drives.")] = "sim",
+    jobs: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    json: Annotated[Path | None, typer.Option(help="Write the results here.")] = None,
+) -> None:
+    """Let hostile policies work in lockstep, and count what breaks an invariant. Status 3 if anything does."""
+    console = Console(highlight=False, soft_wrap=True)
+    with readable_errors():
+        names = robot or robot_names()
+        for name in names:
+            load_robot(name)
+        began, results = time.monotonic(), []
+        todo = list(cases(names, ticks, backend, seed))
+        for done, result in enumerate(soak(todo, jobs), 1):
+            results.append(result)
+            found = sum(result["violations"].values()) + result["guard_trips"] + bool(result["ended"])
+            mark = "[red]found[/]" if found else "[green]none [/]"
+            worst = "  ".join(f"{key} {1e3 * value:+.1f}" for key, value in result["worst"].items())
+            what = f"{result['robot']:8s} {result['mode']:8s} {result['policy']:9s} {result['ticks']:8d} ticks"
+            console.print(f"{done:3d}/{len(todo)}  {mark}  {what}  {worst}  stops {result['trips'] or 'none'}")
+            if result["ended"]:
+                console.print(f"    ended: {result['ended_by']}", markup=False)
+        total = sum(result["ticks"] for result in results)
+        violations = sum(sum(result["violations"].values()) for result in results)
+        guard = sum(result["guard_trips"] for result in results)
+        ended = sum(bool(result["ended"]) for result in results)
+        seconds = time.monotonic() - began
+        console.print(
+            f"{total} ticks in {seconds:.0f} s: {violations} violations, {guard} guard trips, {ended} ended early"
+        )
+        if json is not None:
+            summary = {"ticks": total, "seconds": round(seconds), "violations": violations, "guard_trips": guard}
+            write_json(json, {**summary, "ended_early": ended, "cases": results})
+    if violations or guard or ended:
+        raise typer.Exit(Exit.STOPPED_BY_SAFETY)
 
 
 def _physics(robot: Robot) -> Callable[[], None]:
