@@ -40,6 +40,7 @@ class Kinematics:
         self._tool = self.model.addFrame(tool)
         load = pin.Inertia(profile.payload, np.zeros(3), PAYLOAD_GYRATION * profile.payload * np.eye(3))
         self.model.appendBodyToJoint(carrier.parentJoint, load, placement)
+        self.model.armature = self.model.armature + np.array([joint.armature for joint in profile.joints])
         self._data = self.model.createData()
         self._aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         self._still = np.zeros(self.model.nv)

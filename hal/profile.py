@@ -86,6 +86,8 @@ class Joint(_Strict):
     gains: Gains
     drive: Drive | None = None
     """None for an arm without CAN drives."""
+    armature: NotNegative = 0.0
+    """Inertia of the motor's rotor as the joint feels it, where the model leaves it out, kg m^2."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "Joint":

@@ -183,6 +183,7 @@ def _build(robot: Robot) -> tuple[mujoco.MjModel, list[int]]:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     _mark_tool(spec, profile)
     for joint in profile.joints:
+        spec.joint(joint.name).armature += joint.armature
         _add_drive(spec, joint.name, joint.torque, profile.twin.lag_s)
     if profile.gripper:
         _couple_fingers(spec, profile.gripper)

@@ -1,0 +1,58 @@
+"""Where the velocity of each joint may be one step from now: caps, and room to brake before its soft limits."""
+
+import numpy as np
+
+from robotctl.hal.robot import Robot
+from robotctl.hal.types import Vector
+
+
+class JointBox:
+    """Bounds on the velocity at the end of a step of constant acceleration, q' = q + dt (v + v')/2.
+
+    Velocity and acceleration caps, and per joint a bound from which braking ends at its soft limit. `velocity_cap`
+    and `acceleration_cap` are what commands may use of the profile's, each (n,).
+    """
+
+    def __init__(self, robot: Robot, step_s: float, brake_share: float = 1.0, back: float = 0.0) -> None:
+        """Prepare for steps of `step_s`; braking relies on `brake_share` of the acceleration cap."""
+        safety, limits = robot.profile.safety, robot.limits
+        usable = 1.0 - safety.cap_margin
+        self.velocity_cap = usable * limits.velocity
+        self.acceleration_cap = usable * limits.acceleration
+        self.step = self.acceleration_cap * step_s
+        """Largest change of velocity in a step (n,), rad/s."""
+        n = self._n = robot.dof
+        self._return = back
+        self._dt = step_s
+        # Upper and mirrored lower bounds side by side: one vector operation serves both.
+        margin = safety.position_margin
+        self._edge = np.concatenate([limits.upper - margin, -(limits.lower + margin)])
+        self._brake2 = np.tile(brake_share * self.acceleration_cap, 2)
+        self._cap2 = np.tile(self.velocity_cap, 2)
+        self._half_step2 = 0.5 * self._brake2 * step_s
+        # Where a joint is further from its limit than braking from the cap takes, the limit asks for nothing.
+        self._free = self._edge - self._cap2 * (0.5 * step_s + self._cap2 / (2.0 * self._brake2))
+        self._mirrored = np.empty(2 * n)
+        # A hair wider, so that the limiter's own full acceleration does not count as clipped for a rounding error.
+        self._change = self.step * (1.0 + 1e-9)
+
+    def bounds(self, position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
+        """Return the least and the largest velocity (n,), rad/s, after a step from `position` and `velocity`."""
+        n = self._n
+        mirrored = self._mirrored
+        np.add(position, (0.5 * self._dt) * velocity, out=mirrored[:n])
+        np.negative(mirrored[:n], out=mirrored[n:])
+        bound = self._cap2 if (mirrored <= self._free).all() else self._position_bound(mirrored)
+        upper, lower = bound[:n], -bound[n:]
+        # The acceleration caps come last: a motion that is past a bound is led back as fast as they allow.
+        least, most = velocity - self._change, velocity + self._change
+        return np.minimum(np.maximum(lower, least), most), np.maximum(np.minimum(upper, most), least)
+
+    def _position_bound(self, mirrored: Vector) -> Vector:
+        """Return the speed towards each limit from which braking ends there: v dt/2 + v^2/(2 a) <= room.
+
+        Past the edge it is zero: no further out. Only a reset routine leads back in.
+        """
+        room = self._edge - mirrored
+        root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * np.maximum(room, 0.0)) - self._half_step2
+        return np.minimum(root + self._return * np.minimum(room, 0.0), self._cap2)
