@@ -7,15 +7,16 @@ import numpy as np
 
 from robotctl.control.collision import CollisionModel
 from robotctl.control.kinematics import Kinematics
-from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
+from robotctl.control.limiter import VelocityLimiter
 from robotctl.control.lowering import damp
 from robotctl.control.reference import Reference
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample, Vector
+from robotctl.safety.observer import MomentumObserver
 from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip, Shaper
-from robotctl.safety.torque import StoppableMotion
+from robotctl.safety.torque import StoppableMotion, TorqueShaper
 from robotctl.safety.trip import Trip
 
 
@@ -39,7 +40,8 @@ class Motion:
         self._limiter = VelocityLimiter(robot)
         self.scene = CollisionModel(robot, kinematics) if robot.profile.collision else None
         self._shaper = Shaper(robot, kinematics, self.scene)
-        self._torque_limiter = TorqueLimiter(robot)
+        self.observer = MomentumObserver(robot.dof, kinematics)
+        self._torque_shaper = TorqueShaper(robot, kinematics, self.scene)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
         self._stale_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
@@ -93,15 +95,27 @@ class Motion:
 
         Or a trip, if braking from the measured motion would end outside a limit: then nothing but `track` may follow.
         """
-        trip = self._stoppable.check(sample)
+        previous, external = self.reference.effort, self.observer.external
+        position, velocity = self._now(sample, previous, external)
+        trip = self._stoppable.check(position, velocity, sample.stamp_ns)
         if trip is not None:
             return trip
-        wanted = self._kinematics.gravity(sample.position) + torque
-        self._torque = self.reference.effort = self._torque_limiter.step(wanted, self.reference.effort)
-        self.reference.resync(sample.position, sample.velocity)
-        self.wanted, self.clip = torque, Clip.NONE
+        wanted = self._kinematics.gravity(position) + torque
+        shaped = self._torque_shaper.step(position, velocity, wanted, previous, external)
+        self._torque = self.reference.effort = shaped.torque
+        self.reference.resync(position, velocity)
+        self.wanted, self.clip = torque, shaped.clip
         self.command = Command(CommandMode.EFFORT, sample.position, self.rest, self._torque)
         return self.command
+
+    def _now(self, sample, torque, external):
+        age = 1e-9 * (sample.stamp_ns - sample.joint_stamp_ns)
+        q, v, k = sample.position, sample.velocity, self._kinematics
+        if not age.any():
+            return q, v
+        M = k.mass_matrix(q) + np.diag(age * k.damping)
+        a = np.linalg.solve(M, torque + external - k.bias(q, v) - k.damping * v)
+        return q + age * v + 0.5 * age**2 * a, v + age * a
 
     def damp(self, position: Vector, share: float) -> Command:
         """Return the command that damps the joints with a share of their gravity compensated."""

@@ -13,8 +13,14 @@ class JointBox:
     and `acceleration_cap` are what commands may use of the profile's, each (n,).
     """
 
-    def __init__(self, robot: Robot, step_s: float, brake_share: float = 1.0, back: float = 0.0) -> None:
-        """Prepare for steps of `step_s`; braking relies on `brake_share` of the acceleration cap."""
+    def __init__(self, robot: Robot, step_s: float, brake_share: float = 1.0, pull: float = 0.0) -> None:
+        """Prepare for steps of `step_s`.
+
+        Args:
+            step_s: s.
+            brake_share: share of the acceleration cap that braking relies on.
+            pull: speed at which a joint past its edge is led back, per distance, 1/s.
+        """
         safety, limits = robot.profile.safety, robot.limits
         usable = 1.0 - safety.cap_margin
         self.velocity_cap = usable * limits.velocity
@@ -22,7 +28,7 @@ class JointBox:
         self.step = self.acceleration_cap * step_s
         """Largest change of velocity in a step (n,), rad/s."""
         n = self._n = robot.dof
-        self._return = back
+        self._pull = pull
         self._dt = step_s
         # Upper and mirrored lower bounds side by side: one vector operation serves both.
         margin = safety.position_margin
@@ -51,8 +57,8 @@ class JointBox:
     def _position_bound(self, mirrored: Vector) -> Vector:
         """Return the speed towards each limit from which braking ends there: v dt/2 + v^2/(2 a) <= room.
 
-        Past the edge it is zero: no further out. Only a reset routine leads back in.
+        Past the edge it is no further out, and back in at `pull` times the excess.
         """
         room = self._edge - mirrored
         root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * np.maximum(room, 0.0)) - self._half_step2
-        return np.minimum(root + self._return * np.minimum(room, 0.0), self._cap2)
+        return np.minimum(root + self._pull * np.minimum(room, 0.0), self._cap2)

@@ -1,8 +1,8 @@
 """What acts on the joints beside their drives: the generalised momentum observer of De Luca and Mattone (2003).
 
-With the momentum p = M(q) v, its known part changes at b = tau + C^T v - g - friction. The residual
-r = K (p - integral of (b + r)) follows the torque that b does not know, first order with time constant 1/K, and needs
-no acceleration. The integral is taken backwards (Euler), so that a late sample cannot make it unstable.
+With the momentum p = M(q) v, the model knows dp/dt = tau + C^T v - g - D v. The residual r = K (p - integral of the
+known part and of r itself) follows the torque that the model does not know, first order with time constant 1/K, and
+needs no acceleration. Dry friction is part of what it finds: a model of that is worth little where it changes sign.
 """
 
 from typing import Protocol
@@ -11,19 +11,15 @@ import numpy as np
 
 from robotctl.hal.types import Sample, Vector
 
-GAIN = 200.0
-"""1/s. Noise of the measured velocity shows in the residual as this many times M dv."""
-CREEP = 0.02
-"""Speed above which dry friction is taken to act fully, rad/s."""
+_GAIN = 200.0
+"""1/s. A velocity that is wrong by dv shows in the residual as up to K M dv."""
 
 
 class Dynamics(Protocol):
-    """What the observer has to know of the arm. Arrays are (n,) and (n, n)."""
+    """What has to be known of the arm's dynamics. Arrays are (n,), of matrices (n, n)."""
 
     damping: Vector
     """Viscous friction, Nms/rad."""
-    friction: Vector
-    """Dry friction, Nm."""
 
     def mass_matrix(self, position: Vector) -> Vector: ...
     def coriolis(self, position: Vector, velocity: Vector) -> Vector: ...
@@ -31,32 +27,35 @@ class Dynamics(Protocol):
 
 
 class MomentumObserver:
-    """Estimates the external torques (n,), Nm, of one arm."""
+    """Estimates the torques (n,), Nm, that act on one arm from outside, and those that its model is wrong by."""
 
     def __init__(self, dof: int, model: Dynamics) -> None:
         self.external: Vector = np.zeros(dof)
-        """The residual after the last sample; dry friction that holds a joint at rest shows in it."""
+        """The residual after the last sample."""
         self._model = model
-        self._rest = np.zeros(dof)
-        self._momentum: Vector | None = None
+        self._nothing = self.external
+        self._before: tuple[Vector, Vector] | None = None
+        """Expected momentum at the last sample, and the model's part of its change."""
         self._stamps = np.zeros(dof, dtype=np.int64)
 
     def step(self, sample: Sample) -> Vector:
-        """Take the next sample and return the residual. With the drives off the observer starts anew, from zero."""
-        position, velocity = sample.position, sample.velocity
-        model = self._model
-        elapsed = 1e-9 * (sample.joint_stamp_ns - self._stamps)
-        self._stamps = sample.joint_stamp_ns
-        momentum = model.mass_matrix(position) @ velocity
-        own = model.coriolis(position, velocity).T @ velocity - model.gravity(position)
-        own -= model.damping * velocity + model.friction * np.tanh(velocity / CREEP)
-        if self._momentum is None or not sample.enabled:
-            self._momentum = momentum if sample.enabled else None
-            self.external = self._rest
-            self._own = own
+        """Take the next sample and return the residual. With the drives off it is zero, and starts anew from there.
+
+        The effort of a sample is taken to have acted since the one before. However late a sample comes, the residual
+        stays stable, since the step is implicit in it.
+        """
+        if not sample.enabled:
+            self._before, self.external = None, self._nothing
             return self.external
-        expected = self._momentum + elapsed * (sample.effort + 0.5 * (self._own + own))
-        self.external = GAIN * (momentum - expected) / (1.0 + GAIN * elapsed)
-        self._momentum = expected + elapsed * self.external
-        self._own = own
+        model, position, velocity = self._model, sample.position, sample.velocity
+        momentum = model.mass_matrix(position) @ velocity
+        own = model.coriolis(position, velocity).T @ velocity - model.gravity(position) - model.damping * velocity
+        if self._before is not None:
+            elapsed = 1e-9 * (sample.joint_stamp_ns - self._stamps)
+            expected, own_before = self._before
+            # The trapezoidal rule: with the model at one end only, the residual would be off by dt/2 of its change.
+            expected = expected + elapsed * (sample.effort + 0.5 * (own_before + own))
+            self.external = _GAIN * (momentum - expected) / (1.0 + _GAIN * elapsed)
+            momentum = expected + elapsed * self.external
+        self._before, self._stamps = (momentum, own), sample.joint_stamp_ns
         return self.external
