@@ -16,7 +16,8 @@ from robotctl.hal.types import Command, CommandMode, Sample, Vector
 from robotctl.safety.observer import MomentumObserver
 from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip, Shaper
-from robotctl.safety.torque import StoppableMotion, TorqueShaper
+from robotctl.safety.stoppable import StoppableMotion
+from robotctl.safety.torque import ArmState, TorqueShaper
 from robotctl.safety.trip import Trip
 
 
@@ -66,6 +67,7 @@ class Motion:
             reference.resync(sample.position, sample.velocity)
         self.wanted, self.clip = wanted, Clip.NONE
         self._before = reference.mark()
+        reference.observe(self.observer.external, sample.velocity)
         # What is no longer heard of is taken to be where it was led: an old error must not drive the integrator.
         stale = sample.stamp_ns - int(sample.joint_stamp_ns.min()) > self._stale_ns
         for _ in range(periods):
@@ -85,9 +87,10 @@ class Motion:
             limited = self._shaper.brake(reference.velocity)
         else:
             limited = self._limiter.step(wanted, reference.velocity, reference.acceleration)
+        possible, lead_clip = self._torque_shaper.lead(reference.state(), limited)
         tool, jacobian = self._kinematics.tool_and_jacobian(reference.position)
-        velocity, clip = self._shaper.step(reference.position, reference.velocity, limited, tool, jacobian)
-        self.clip |= clip
+        velocity, clip = self._shaper.step(reference.position, reference.velocity, possible, tool, jacobian)
+        self.clip |= lead_clip | clip
         return velocity
 
     def push(self, torque: Vector, sample: Sample) -> Command | Trip:
@@ -95,27 +98,18 @@ class Motion:
 
         Or a trip, if braking from the measured motion would end outside a limit: then nothing but `track` may follow.
         """
-        previous, external = self.reference.effort, self.observer.external
-        position, velocity = self._now(sample, previous, external)
+        effort = self.reference.effort
+        position, velocity = self.observer.present(sample, effort)
         trip = self._stoppable.check(position, velocity, sample.stamp_ns)
         if trip is not None:
             return trip
-        wanted = self._kinematics.gravity(position) + torque
-        shaped = self._torque_shaper.step(position, velocity, wanted, previous, external)
-        self._torque = self.reference.effort = shaped.torque
+        state = ArmState(position, velocity, effort, self.observer.external)
+        self._torque, self.clip = self._torque_shaper.push(state, self._kinematics.gravity(position) + torque)
+        self.wanted = torque
+        self.reference.effort = self._torque
         self.reference.resync(position, velocity)
-        self.wanted, self.clip = torque, shaped.clip
         self.command = Command(CommandMode.EFFORT, sample.position, self.rest, self._torque)
         return self.command
-
-    def _now(self, sample, torque, external):
-        age = 1e-9 * (sample.stamp_ns - sample.joint_stamp_ns)
-        q, v, k = sample.position, sample.velocity, self._kinematics
-        if not age.any():
-            return q, v
-        M = k.mass_matrix(q) + np.diag(age * k.damping)
-        a = np.linalg.solve(M, torque + external - k.bias(q, v) - k.damping * v)
-        return q + age * v + 0.5 * age**2 * a, v + age * a
 
     def damp(self, position: Vector, share: float) -> Command:
         """Return the command that damps the joints with a share of their gravity compensated."""

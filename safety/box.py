@@ -5,37 +5,40 @@ import numpy as np
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
 
+_RETURN_SHARE = 0.1
+"""Share of the velocity cap at which a joint past its edge is led back at most."""
+
 
 class JointBox:
-    """Bounds on the velocity at the end of a step of constant acceleration, q' = q + dt (v + v')/2.
+    """Bounds on the velocity at the end of a step of constant acceleration, q' = q + dt (v + v')/2."""
 
-    Velocity and acceleration caps, and per joint a bound from which braking ends at its soft limit. `velocity_cap`
-    and `acceleration_cap` are what commands may use of the profile's, each (n,).
-    """
-
-    def __init__(self, robot: Robot, step_s: float, brake_share: float = 1.0, pull: float = 0.0) -> None:
+    def __init__(
+        self, robot: Robot, step_s: float, usable: float, *, brake_share: float = 1.0, pull: float = 0.0
+    ) -> None:
         """Prepare for steps of `step_s`.
 
         Args:
             step_s: s.
-            brake_share: share of the acceleration cap that braking relies on.
+            usable: share of the velocity and acceleration caps that may be used.
+            brake_share: share of that acceleration that braking before a soft limit relies on.
             pull: speed at which a joint past its edge is led back, per distance, 1/s.
         """
-        safety, limits = robot.profile.safety, robot.limits
-        usable = 1.0 - safety.cap_margin
+        limits = robot.limits
         self.velocity_cap = usable * limits.velocity
+        """(n,), rad/s"""
         self.acceleration_cap = usable * limits.acceleration
+        """(n,), rad/s^2"""
         self.step = self.acceleration_cap * step_s
         """Largest change of velocity in a step (n,), rad/s."""
         n = self._n = robot.dof
-        self._pull = pull
         self._dt = step_s
         # Upper and mirrored lower bounds side by side: one vector operation serves both.
-        margin = safety.position_margin
+        margin = robot.profile.safety.position_margin
         self._edge = np.concatenate([limits.upper - margin, -(limits.lower + margin)])
         self._brake2 = np.tile(brake_share * self.acceleration_cap, 2)
         self._cap2 = np.tile(self.velocity_cap, 2)
         self._half_step2 = 0.5 * self._brake2 * step_s
+        self._pull = pull
         # Where a joint is further from its limit than braking from the cap takes, the limit asks for nothing.
         self._free = self._edge - self._cap2 * (0.5 * step_s + self._cap2 / (2.0 * self._brake2))
         self._mirrored = np.empty(2 * n)
@@ -61,4 +64,5 @@ class JointBox:
         """
         room = self._edge - mirrored
         root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * np.maximum(room, 0.0)) - self._half_step2
-        return np.minimum(root + self._pull * np.minimum(room, 0.0), self._cap2)
+        back = np.maximum(self._pull * np.minimum(room, 0.0), -_RETURN_SHARE * self._cap2)
+        return np.minimum(root + back, self._cap2)

@@ -24,6 +24,7 @@ class Dynamics(Protocol):
     def mass_matrix(self, position: Vector) -> Vector: ...
     def coriolis(self, position: Vector, velocity: Vector) -> Vector: ...
     def gravity(self, position: Vector) -> Vector: ...
+    def bias(self, position: Vector, velocity: Vector) -> Vector: ...
 
 
 class MomentumObserver:
@@ -59,3 +60,15 @@ class MomentumObserver:
             momentum = expected + elapsed * self.external
         self._before, self._stamps = (momentum, own), sample.joint_stamp_ns
         return self.external
+
+    def present(self, sample: Sample, torque: Vector) -> tuple[Vector, Vector]:
+        """Return where the joints are by now (n,), rad, and how they move (n,), rad/s.
+
+        A sample that came over a bus tells how they moved when they were heard of; since then, `torque` has acted.
+        """
+        model, position, velocity = self._model, sample.position, sample.velocity
+        age = 1e-9 * (sample.stamp_ns - sample.joint_stamp_ns)
+        force = torque + self.external - model.bias(position, velocity) - model.damping * velocity
+        inertia = model.mass_matrix(position) + np.diag(age * model.damping)
+        change = age * np.linalg.solve(inertia, force)
+        return position + age * (velocity + 0.5 * change), velocity + change

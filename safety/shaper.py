@@ -81,7 +81,7 @@ class Shaper:
         safety = robot.profile.safety
         self._dt = robot.period_ns * 1e-9
         self._tool = model.tool
-        self._box = JointBox(robot, self._dt)
+        self._box = JointBox(robot, self._dt, 1.0 - safety.cap_margin)
         self.velocity_cap = self._box.velocity_cap
         self.acceleration_cap = self._box.acceleration_cap
         self.regions = regions(robot.profile, safety.sphere_margin)

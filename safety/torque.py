@@ -1,16 +1,15 @@
-"""P8: torque targets keep every limit, too, and the arm can be stopped whatever its model is wrong by.
+"""Torques that keep every limit: what a torque target may become (P8), and how fast a reference can be led (P7).
 
-With M(q) a + h(q, v) = tau + r, r being what the momentum observer finds, one QP takes the torque that comes closest
-to the wanted one (in the metric of M^-1, so that its acceleration comes closest in that of M: Gauss' principle of
-least constraint) under three groups of bounds, of which a later one gives way to those before it:
+With M(q) a + h(q, v) = tau + r, r being what acts beside the drives, one QP takes the torque closest to the wanted
+one (in the metric of M^-1, so that its acceleration comes closest in that of M: Gauss' principle of least
+constraint) under three groups of bounds. What cannot be kept gives way to the groups before it, as little as may be:
 
-1. the torque caps, and what the torque may change by in a servo period;
+1. the torque caps, and what the torque may change by in a servo period; these are firm;
 2. per joint, velocity and acceleration caps, and a bound from which braking ends at the soft limit;
-3. every region, and every pair of links that is near, at three poses ahead: y(q, v) after the reaction time, and
-   where braking at all or at half of the acceleration cap would end. With dy/dt = v + D(v) a the rows read
-   n J(y) (v + D a) <= k h(y): y approaches a surface only as fast as the room h left there allows.
+3. what regions and links ahead allow (`lookahead`).
 
-Where nothing binds, the wanted torque is returned unchanged.
+All of these are to be reached within a reaction time, not at once: that is what covers a late tick, the torque's
+rate and a wrong model. Where nothing binds, the wanted torque is returned unchanged.
 """
 
 from itertools import compress
@@ -22,19 +21,11 @@ import numpy as np
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
 from robotctl.safety.box import JointBox
-from robotctl.safety.proximity import NothingNear, ProximityLimit, Scene
-from robotctl.safety.region import Row, regions
-from robotctl.safety.shaper import Clip, ToolModel
-from robotctl.safety.trip import Category, Protection, Trip
+from robotctl.safety.lookahead import BRAKE_SHARES, Geometry, Lookahead
+from robotctl.safety.proximity import Scene
+from robotctl.safety.shaper import Clip, Shaped
 
 _REACTION_S = 0.02
-"""Time in which a bound may be reached: it covers a late tick, the torque's rate, and a model that is wrong."""
-_BRAKE_SHARES = (1.0, 0.5)
-"""Shares of the acceleration cap at which stops are looked ahead to; joint limits rely on the smallest."""
-_TRIP_REACTION_S = 0.01
-"""Time before the braking that the motion measured has to be stoppable by."""
-_BREACH = 2e-3
-"""How far past a soft limit that stop may end, rad, and past the bound of a region, m."""
 _UNBOUNDED = 1e30
 _SOFT = 8
 """daqp's sense of a constraint that may give way."""
@@ -42,15 +33,27 @@ _SOLVED = (1, 2)
 """daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
 
 
-class ArmModel(ToolModel, Protocol):
-    """What the shaper has to know of the arm. Arrays are (n,), of matrices (n, n)."""
+class Dynamics(Geometry, Protocol):
+    """What has to be known of the arm. Arrays are (n,), of matrices (n, n)."""
 
     damping: Vector
     """Viscous friction, Nms/rad."""
 
-    def tool_and_jacobian(self, position: Vector) -> tuple[Vector, Vector]: ...
     def mass_matrix(self, position: Vector) -> Vector: ...
     def bias(self, position: Vector, velocity: Vector) -> Vector: ...
+
+
+class ArmState(NamedTuple):
+    """A motion, and the torques that belong to it. Arrays are (n,)."""
+
+    position: Vector
+    """rad"""
+    velocity: Vector
+    """rad/s"""
+    effort: Vector
+    """Torque that was sent last, Nm."""
+    external: Vector
+    """What acts beside the drives, Nm."""
 
 
 class ShapedTorque(NamedTuple):
@@ -64,130 +67,99 @@ class ShapedTorque(NamedTuple):
 class TorqueShaper:
     """Shapes the torques of one robot. Remembers clearances only; every call stands for itself."""
 
-    def __init__(self, robot: Robot, model: ArmModel, scene: Scene | None = None) -> None:
+    def __init__(self, robot: Robot, model: Dynamics, scene: Scene | None = None) -> None:
         """Shape for a robot's limits; with a `scene`, for its clearances, too."""
-        safety, twin = robot.profile.safety, robot.profile.twin
+        twin = robot.profile.twin
         self._model = model
         self._dt = robot.period_ns * 1e-9
         self._reaction = _REACTION_S + twin.lag_s + twin.delay_s
-        self._box = JointBox(robot, self._reaction, min(_BRAKE_SHARES), pull=0.25 / self._reaction)
         self._cap = robot.limits.torque
         self._step = robot.limits.torque_rate * self._dt
-        self._regions = regions(robot.profile, safety.sphere_margin)
-        # How long each joint brakes for per rad/s (n,), on the way to each pose that is looked ahead to.
-        self._braking = [np.zeros(robot.dof)] + [1.0 / (share * self._box.acceleration_cap) for share in _BRAKE_SHARES]
-        self._proximity = [ProximityLimit(robot, scene or NothingNear(robot.dof), 0) for _ in self._braking]
+        share, usable = min(BRAKE_SHARES), 1.0 - robot.profile.safety.cap_margin
+        self._measured = JointBox(robot, self._reaction, usable, brake_share=share, pull=0.25 / self._reaction)
+        # A reference does not stray; its own limiter keeps the margin to the caps.
+        self._led = JointBox(robot, self._reaction, 1.0, brake_share=share)
+        self._lookahead = Lookahead(robot, model, self._reaction, scene)
 
-    def step(
-        self, position: Vector, velocity: Vector, wanted: Vector, previous: Vector, external: Vector
-    ) -> ShapedTorque:
-        """Return the torque for the next servo period.
+    def push(self, state: ArmState, wanted: Vector) -> ShapedTorque:
+        """Return the torque for the next servo period of an arm that moves as `state` tells.
 
         Args:
-            position: of the joints now (n,), rad.
-            velocity: (n,), rad/s.
+            state: measured; its external torque as observed.
             wanted: torque to come as close to as the limits allow (n,), Nm, finite.
-            previous: torque that was sent last (n,), Nm.
-            external: what acts beside the drives, as observed (n,), Nm.
         """
-        n, model, box = len(position), self._model, self._box
+        inertia, load = self._dynamics(state)
+        return self._closest(state, wanted, np.linalg.inv(inertia), load, self._measured)
+
+    def lead(self, state: ArmState, following: Vector) -> Shaped:
+        """Return the velocity of a reference after the next servo period, as torques allow.
+
+        Args:
+            state: the reference's.
+            following: velocity to come as close to as the limits allow (n,), rad/s.
+        """
+        inertia, load = self._dynamics(state)
+        wanted = inertia @ ((following - state.velocity) / self._dt) + load
+        mobility = np.linalg.inv(inertia)
+        torque, clip = self._closest(state, wanted, mobility, load, self._led)
+        if torque is wanted:
+            return Shaped(following, clip)
+        return Shaped(state.velocity + self._dt * (mobility @ (torque - load)), clip)
+
+    def _dynamics(self, state: ArmState) -> tuple[Vector, Vector]:
+        """Return M (n, n) and h - r (n,), so that M a + h - r is the mean torque of a servo period."""
+        position, velocity, _, external = state
         middle = position + 0.5 * self._dt * velocity
         # Viscous friction is taken at the period's end: a joint that it dominates settles within the period.
-        inertia = model.mass_matrix(middle) + self._dt * np.diag(model.damping)
-        load = model.bias(middle, velocity) + model.damping * velocity - external
-        mobility = np.linalg.inv(inertia)
-        ahead, bounds, flags = self._ahead(position, velocity)
-        slowest, fastest = box.bounds(position, velocity)
-        rows = np.vstack([mobility, ahead @ mobility])
+        inertia = self._model.mass_matrix(middle) + self._dt * np.diag(self._model.damping)
+        return inertia, self._model.bias(middle, velocity) + self._model.damping * velocity - external
+
+    def _closest(self, state: ArmState, wanted: Vector, mobility: Vector, load: Vector, box: JointBox) -> ShapedTorque:
+        n, velocity = len(wanted), state.velocity
+        normals, bounds, flags = self._lookahead.rows(state.position, velocity)
+        slowest, fastest = box.bounds(state.position, velocity)
+        rows = np.vstack([mobility, normals @ mobility])
+        # With a = rows @ (torque - load), bounds on accelerations become bounds on the torque.
         free = rows @ load
-        lower = np.concatenate([(slowest - velocity) / self._reaction, np.full(len(bounds), -_UNBOUNDED)]) + free
-        upper = np.concatenate([(fastest - velocity) / self._reaction, bounds]) + free
-        lower = np.concatenate([np.maximum(-self._cap, previous - self._step), lower])
-        upper = np.concatenate([np.minimum(self._cap, previous + self._step), upper])
+        least, most = (slowest - velocity) / self._reaction, (fastest - velocity) / self._reaction
+        lower = np.concatenate([np.maximum(-self._cap, state.effort - self._step), least + free[:n]])
+        lower = np.concatenate([lower, np.full(len(bounds), -_UNBOUNDED)])
+        upper = np.concatenate([np.minimum(self._cap, state.effort + self._step), most + free[:n], bounds + free[n:]])
         result = np.concatenate([wanted, rows @ wanted])
         broken = (result > upper) | (result < lower)
         if not broken.any():
             return ShapedTorque(wanted, Clip.NONE)
-        torque = self._solve(wanted, mobility, rows, lower, upper)
-        if torque is None:
-            torque = load + inertia @ (np.minimum(np.maximum(-velocity, -box.step), box.step) / self._reaction)
-        clip = self._passed(velocity, velocity + self._reaction * (result[n:] - free)[:n], slowest, fastest)
-        if broken[:n].any():
-            clip |= Clip.TORQUE
+        clip = Clip.TORQUE if broken[:n].any() else Clip.NONE
         for flag in compress(flags, broken[2 * n :]):
             clip |= flag
+        following = velocity + self._reaction * (result[n:] - free)[:n]
+        clip |= _passed(velocity, following, slowest, fastest, box)
+        torque = _solve(wanted, mobility, rows, lower, upper)
+        if torque is None:
+            braking = np.minimum(np.maximum(-velocity, -box.step), box.step) / self._reaction
+            torque = load + np.linalg.solve(mobility, braking)
         return ShapedTorque(np.minimum(np.maximum(torque, lower[:n]), upper[:n]), clip)
 
-    def _ahead(self, position: Vector, velocity: Vector) -> tuple[Vector, Vector, list[Clip]]:
-        """Return rows (m, n) and bounds (m,) on the acceleration, row . a <= bound, and the limit behind each."""
-        rows, flags = [], []
-        for braking, proximity in zip(self._braking, self._proximity, strict=True):
-            rest = braking * np.abs(velocity)
-            pose = position + (self._reaction + 0.5 * rest) * velocity
-            point, jacobian = self._model.tool_and_jacobian(pose)
-            found = [(region.row(point, jacobian), Clip.KEEP_OUT) for region in self._regions]
-            found[0] = (found[0][0], Clip.SPHERE)
-            found += [(row, Clip.PROXIMITY) for row in proximity.look(pose)[0]]
-            for row, flag in found:
-                if row is not None:
-                    rows.append(Row(row.normal * (self._reaction + rest), row.bound - float(row.normal @ velocity)))
-                    flags.append(flag)
-        return np.array([row.normal for row in rows]), np.array([row.bound for row in rows]), flags
 
-    def _passed(self, velocity: Vector, following: Vector, slowest: Vector, fastest: Vector) -> Clip:
-        """Return which limits of joints a step from `velocity` to `following` passes, given the bounds of that step."""
-        cap, step = self._box.velocity_cap, self._box.step
-        most = np.minimum(cap, velocity + step)
-        least = np.maximum(-cap, velocity - step)
-        clip = Clip.NONE
-        if (np.abs(following) > cap).any():
-            clip |= Clip.VELOCITY
-        if (np.abs(following - velocity) > step).any():
-            clip |= Clip.ACCELERATION
-        if (((following > fastest) & (fastest < most)) | ((following < slowest) & (slowest > least))).any():
-            clip |= Clip.POSITION
-        return clip
-
-    def _solve(self, wanted: Vector, mobility: Vector, rows: Vector, lower: Vector, upper: Vector) -> Vector | None:
-        n = len(wanted)
-        sense = np.full(len(upper), _SOFT, dtype=np.int32)
-        sense[:n] = 0
-        levels = np.array([n, 2 * n, len(upper)], dtype=np.int32)
-        solution, _, flag, _ = daqp.solve(mobility, -mobility @ wanted, rows, upper, lower, sense, levels)
-        return np.asarray(solution) if flag in _SOLVED else None
+def _solve(wanted: Vector, mobility: Vector, rows: Vector, lower: Vector, upper: Vector) -> Vector | None:
+    """Return the torque closest to the wanted one: itself bounded first, then the result of each row."""
+    n = len(wanted)
+    sense = np.full(len(upper), _SOFT, dtype=np.int32)
+    sense[:n] = 0
+    levels = np.array([n, 2 * n, len(upper)], dtype=np.int32)
+    torque, _, flag, _ = daqp.solve(mobility, -mobility @ wanted, rows, upper, lower, sense, levels)
+    return torque if flag in _SOLVED else None
 
 
-class StoppableMotion:
-    """Braking from the present motion has to end inside joint limits, velocity caps and regions; else category 2."""
-
-    def __init__(self, robot: Robot, model: ToolModel) -> None:
-        self._names = [joint.name for joint in robot.profile.joints]
-        self._limits = robot.limits
-        self._tolerance = robot.profile.safety.velocity_tolerance
-        self._deceleration = (1.0 - robot.profile.safety.cap_margin) * robot.limits.acceleration
-        self._regions = regions(robot.profile)
-        self._tool = model.tool
-
-    def check(self, position: Vector, velocity: Vector, stamp_ns: int) -> Trip | None:
-        """Judge joint positions (n,), rad, and velocities (n,), rad/s."""
-        speed = np.abs(velocity)
-        ahead = _TRIP_REACTION_S * velocity + 0.5 * speed * velocity / self._deceleration
-        stop = position + ahead
-        beyond = np.maximum(stop - self._limits.upper, self._limits.lower - stop)
-        fast = speed - self._limits.velocity - self._tolerance
-        joint = int(beyond.argmax())
-        if not beyond[joint] <= _BREACH:  # in this direction, so that NaN trips, too
-            return _trip(f"{self._names[joint]} would stop {beyond[joint]:.3f} rad outside its limits", stamp_ns)
-        joint = int(fast.argmax())
-        if not fast[joint] <= 0.0:
-            return _trip(f"{self._names[joint]} moves at {speed[joint]:.2f} rad/s, over its cap", stamp_ns)
-        point = self._tool(stop)
-        for region in self._regions:
-            if region.room(point) < -_BREACH:
-                return _trip(f"the tool would stop past the bound of {region.name!r}", stamp_ns)
-        return None
-
-
-def _trip(what: str, stamp_ns: int) -> Trip:
-    cause = f"{what}; braking took over from the torque target"
-    return Trip(Protection.TORQUE_STATE, Category.BRAKE_HOLD, cause, stamp_ns)
+def _passed(velocity: Vector, following: Vector, slowest: Vector, fastest: Vector, box: JointBox) -> Clip:
+    """Return which limits of joints a step from `velocity` to `following` passes, given the bounds of that step."""
+    most = np.minimum(box.velocity_cap, velocity + box.step)
+    least = np.maximum(-box.velocity_cap, velocity - box.step)
+    clip = Clip.NONE
+    if (np.abs(following) > box.velocity_cap).any():
+        clip |= Clip.VELOCITY
+    if (np.abs(following - velocity) > box.step).any():
+        clip |= Clip.ACCELERATION
+    if (((following > fastest) & (fastest < most)) | ((following < slowest) & (slowest > least))).any():
+        clip |= Clip.POSITION
+    return clip
