@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 
 from robotctl.hal.errors import ConfigError
+from robotctl.hal.profile import PAYLOAD_GYRATION
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector, frozen
 
@@ -37,8 +38,12 @@ class Kinematics:
         placement = carrier.placement * pin.SE3(np.eye(3), np.array(profile.tool_offset))
         tool = pin.Frame("robotctl_tool", carrier.parentJoint, carrier.parentFrame, placement, pin.FrameType.OP_FRAME)
         self._tool = self.model.addFrame(tool)
+        load = pin.Inertia(profile.payload, np.zeros(3), PAYLOAD_GYRATION * profile.payload * np.eye(3))
+        self.model.appendBodyToJoint(carrier.parentJoint, load, placement)
+        self.model.armature = self.model.armature + np.array([joint.armature for joint in profile.joints])
         self._data = self.model.createData()
         self._aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        self._still = np.zeros(self.model.nv)
         links = [float(np.linalg.norm(joint.translation)) for joint in list(self.model.jointPlacements)[2:]]
         links.append(float(np.linalg.norm(placement.translation)))
         self.reach = frozen(np.cumsum(links[::-1])[::-1])
@@ -73,8 +78,20 @@ class Kinematics:
 
     def mass_matrix(self, position: Vector) -> Vector:
         """Return the joint-space inertia (n, n), kg m^2."""
-        upper = np.triu(pin.crba(self.model, self._data, position))
-        return np.array(upper + np.triu(upper, 1).T)
+        return np.array(pin.crba(self.model, self._data, position))
+
+    def bias(self, position: Vector, velocity: Vector) -> Vector:
+        """Return the torques (n,) that keep the velocities constant, Nm: Coriolis, centrifugal, gravity, no friction."""
+        return np.array(pin.nonLinearEffects(self.model, self._data, position, velocity))
+
+    def coriolis(self, position: Vector, velocity: Vector) -> Vector:
+        """Return C (n, n) with C v the Coriolis and centrifugal torques, such that dM/dt = C + C^T."""
+        return np.array(pin.computeCoriolisMatrix(self.model, self._data, position, velocity))
+
+    def tool_drift(self, position: Vector, velocity: Vector) -> Vector:
+        """Return dJ/dt v (3,), m/s^2: how the tool point accelerates while the joint velocities stay constant."""
+        pin.forwardKinematics(self.model, self._data, position, velocity, self._still)
+        return np.array(pin.getFrameClassicalAcceleration(self.model, self._data, self._tool, self._aligned).linear)
 
 
 def locked(robot: Robot, full: pin.Model, opening: float) -> tuple[list[int], Vector]:

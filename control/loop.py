@@ -145,6 +145,7 @@ class Loop:
         sample = supervisor.screen(self._arm.read())
         self._guard.observe(sample, now, self.lateness_ns)
         tool = self.kinematics.tool(sample.position)
+        motion.observer.step(sample)
         supervisor.observe(sample, tool, motion.reference.position, motion.reference.velocity, now)
         target = self._link.mailbox.take()
         if target is not None:

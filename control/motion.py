@@ -7,15 +7,17 @@ import numpy as np
 
 from robotctl.control.collision import CollisionModel
 from robotctl.control.kinematics import Kinematics
-from robotctl.control.limiter import TorqueLimiter, VelocityLimiter
+from robotctl.control.limiter import VelocityLimiter
 from robotctl.control.lowering import damp
 from robotctl.control.reference import Reference
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample, Vector
+from robotctl.safety.observer import MomentumObserver
 from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip, Shaper
-from robotctl.safety.torque import StoppableMotion
+from robotctl.safety.stoppable import StoppableMotion
+from robotctl.safety.torque import ArmState, TorqueShaper
 from robotctl.safety.trip import Trip
 
 
@@ -39,7 +41,8 @@ class Motion:
         self._limiter = VelocityLimiter(robot)
         self.scene = CollisionModel(robot, kinematics) if robot.profile.collision else None
         self._shaper = Shaper(robot, kinematics, self.scene)
-        self._torque_limiter = TorqueLimiter(robot)
+        self.observer = MomentumObserver(robot.dof, kinematics)
+        self._torque_shaper = TorqueShaper(robot, kinematics, self.scene)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
         self._stale_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
@@ -93,13 +96,16 @@ class Motion:
 
         Or a trip, if braking from the measured motion would end outside a limit: then nothing but `track` may follow.
         """
-        trip = self._stoppable.check(sample)
+        effort = self.reference.effort
+        position, velocity = self.observer.present(sample, effort)
+        trip = self._stoppable.check(position, velocity, sample.stamp_ns)
         if trip is not None:
             return trip
-        wanted = self._kinematics.gravity(sample.position) + torque
-        self._torque = self.reference.effort = self._torque_limiter.step(wanted, self.reference.effort)
-        self.reference.resync(sample.position, sample.velocity)
-        self.wanted, self.clip = torque, Clip.NONE
+        state = ArmState(position, velocity, effort, self.observer.external)
+        self._torque, self.clip = self._torque_shaper.push(state, self._kinematics.gravity(position) + torque)
+        self.wanted = torque
+        self.reference.effort = self._torque
+        self.reference.resync(position, velocity)
         self.command = Command(CommandMode.EFFORT, sample.position, self.rest, self._torque)
         return self.command
 

@@ -11,6 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 CLASSIC_HZ = 250
 """Highest servo rate of eight drives on classic CAN at 1 Mbit/s: 2.2 ms of wire time per cycle."""
 
+PAYLOAD_GYRATION = 1e-3
+"""Inertia of a payload about its own centre per kilogram, m^2; as of a ball of 10 cm."""
+
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
@@ -83,6 +86,8 @@ class Joint(_Strict):
     gains: Gains
     drive: Drive | None = None
     """None for an arm without CAN drives."""
+    armature: NotNegative = 0.0
+    """Inertia of the motor's rotor as the joint feels it, where the model leaves it out, kg m^2."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "Joint":
@@ -276,8 +281,8 @@ class Twin(_Strict):
     """Standard deviation of measured positions, rad."""
     noise_velocity: NotNegative = 0.0
     """Standard deviation of measured velocities, rad/s."""
-    payload: NotNegative = 0.0
-    """Mass at the tool that the controller is not told of, kg."""
+    payload: Finite = 0.0
+    """Mass at the tool point that the controller is not told of, kg; negative where it is told of too much."""
     start: list[Finite] | None = None
     """Where the arm stands when it wakes up, rad; None for the rest pose. It may be outside the limits."""
 
@@ -326,6 +331,9 @@ class RobotProfile(_Strict):
             **{f"home_via.{index}": pose for index, pose in enumerate(self.home_via)},
         }
 
+    payload: NotNegative = 0.0
+    """Mass at the tool point that is known, kg; gravity and inertia of the arm's model include it."""
+
     @model_validator(mode="after")
     def _consistent(self) -> "RobotProfile":
         if self.twin.start is not None and len(self.twin.start) != len(self.joints):
@@ -351,6 +359,10 @@ class RobotProfile(_Strict):
             raise ValueError(f"keep_out: more than one region is called {sorted(same)}")
         if self.can and not self.can.fd and self.servo_hz > CLASSIC_HZ:
             raise ValueError(f"servo_hz: classic CAN carries at most {CLASSIC_HZ} Hz, not {self.servo_hz}")
+        if self.payload + self.twin.payload < 0.0:
+            raise ValueError(
+                f"twin.payload: {self.twin.payload} kg takes away more than the payload of {self.payload} kg"
+            )
         if self.can and any(joint.drive is None for joint in self.joints):
             raise ValueError("can: set, but not every joint has a drive")
         return self

@@ -20,6 +20,7 @@ import numpy as np
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
+from robotctl.safety.box import JointBox
 from robotctl.safety.proximity import NothingNear, ProximityLimit, Scene
 from robotctl.safety.region import Region, Row, regions
 
@@ -53,7 +54,7 @@ class ToolModel(Protocol):
 
 
 class Clip(IntFlag):
-    """Why a velocity differs from the one that was wanted."""
+    """Why a velocity or a torque differs from the one that was wanted."""
 
     NONE = 0
     VELOCITY = 1
@@ -64,6 +65,8 @@ class Clip(IntFlag):
     """Not a limit: the arm began outside its limits, and only a retreat may move it."""
     KEEP_OUT = 32
     PROXIMITY = 64
+    ACCELERATION = 128
+    TORQUE = 256
 
 
 class Shaped(NamedTuple):
@@ -79,12 +82,12 @@ class Shaper:
 
     def __init__(self, robot: Robot, model: ToolModel, scene: Scene | None = None) -> None:
         """Shape for a robot's limits; with a `scene`, for its clearances, too."""
-        safety, limits = robot.profile.safety, robot.limits
-        usable = 1.0 - safety.cap_margin
+        safety = robot.profile.safety
         self._dt = robot.period_ns * 1e-9
         self._tool = model.tool
-        self.velocity_cap = usable * limits.velocity
-        self.acceleration_cap = usable * limits.acceleration
+        self._box = JointBox(robot, self._dt, 1.0 - safety.cap_margin)
+        self.velocity_cap = self._box.velocity_cap
+        self.acceleration_cap = self._box.acceleration_cap
         self.regions = regions(robot.profile, safety.sphere_margin)
         self._sphere = self.regions[0]
         self._gain = safety.sphere_gain
@@ -93,18 +96,6 @@ class Shaper:
         scene = scene or NothingNear(robot.dof)
         self._proximity = ProximityLimit(robot, scene, len(_SAMPLES))
         self._n = robot.dof
-        # Upper and mirrored lower bounds side by side: one vector operation serves both.
-        margin = safety.position_margin
-        self._edge = np.concatenate([limits.upper - margin, -(limits.lower + margin)])
-        self._brake2 = np.tile(self.acceleration_cap, 2)
-        self._cap2 = np.tile(self.velocity_cap, 2)
-        self._half_step2 = 0.5 * self._brake2 * self._dt
-        # Where a joint is further from its limit than braking from the cap takes, the limit asks for nothing.
-        self._free = self._edge - self._cap2 * (0.5 * self._dt + self._cap2 / (2.0 * self._brake2))
-        self._mirrored = np.empty(2 * self._n)
-        self._step = self.acceleration_cap * self._dt
-        # A hair wider, so that the limiter's own full acceleration does not count as clipped for a rounding error.
-        self._change = self._step * (1.0 + 1e-9)
         self._half_dt = 0.5 * self._dt
         self._half_brake = 0.5 / self.acceleration_cap
         # With this, speed @ reach bounds the tool's speed.
@@ -126,7 +117,7 @@ class Shaper:
             tool: tool point at `position` (3,), m.
             jacobian: its translational Jacobian (3, n).
         """
-        lower, upper = self._box(position, velocity)
+        lower, upper = self._box.bounds(position, velocity)
         best, clip = np.minimum(np.maximum(wanted, lower), upper), Clip.NONE
         if (best == wanted).all():
             best = wanted
@@ -144,27 +135,8 @@ class Shaper:
 
     def brake(self, velocity: Vector) -> Vector:
         """Return the velocity after one step of braking every joint at its cap."""
-        return velocity - np.minimum(np.maximum(velocity, -self._step), self._step)
-
-    def _box(self, position: Vector, velocity: Vector) -> tuple[Vector, Vector]:
-        n, dt = self._n, self._dt
-        mirrored = self._mirrored
-        np.add(position, (0.5 * dt) * velocity, out=mirrored[:n])
-        np.negative(mirrored[:n], out=mirrored[n:])
-        bound = self._cap2 if (mirrored <= self._free).all() else self._position_bound(mirrored)
-        upper, lower = bound[:n], -bound[n:]
-        # The acceleration caps come last: a reference that is past a bound is led back as fast as they allow.
-        least, most = velocity - self._change, velocity + self._change
-        return np.minimum(np.maximum(lower, least), most), np.maximum(np.minimum(upper, most), least)
-
-    def _position_bound(self, mirrored: Vector) -> Vector:
-        """Return the speed towards each limit from which braking ends there: v dt/2 + v^2/(2 a) <= room.
-
-        Past the edge it is zero: no further out. Only a reset routine leads back in.
-        """
-        room = np.maximum(self._edge - mirrored, 0.0)
-        root = np.sqrt(self._half_step2**2 + 2.0 * self._brake2 * room) - self._half_step2
-        return np.minimum(root, self._cap2)
+        step = self._box.step
+        return velocity - np.minimum(np.maximum(velocity, -step), step)
 
     def _keep_rows(
         self,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotctl.hal.errors import ConfigError
-from robotctl.hal.profile import GripperProfile, RobotProfile
+from robotctl.hal.profile import PAYLOAD_GYRATION, GripperProfile, RobotProfile
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Truth, Vector
 from robotctl.sim.scene import Scene
@@ -192,6 +192,7 @@ def _build(robot: Robot, scene: Scene | None) -> tuple[mujoco.MjModel, list[int]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     _mark_tool(spec, profile)
     for joint in profile.joints:
+        spec.joint(joint.name).armature += joint.armature
         _add_drive(spec, joint.name, joint.torque, profile.twin.lag_s)
     if profile.gripper:
         _couple_fingers(spec, profile.gripper)
@@ -225,12 +226,13 @@ def _mark_tool(spec: mujoco.MjSpec, profile: RobotProfile) -> None:
     if body is None:
         site = spec.site(profile.tool_frame)
         body, position = site.parent, site.pos + position
-    payload = profile.twin.payload
+    payload = profile.payload + profile.twin.payload
     body.add_site(name="robotctl_tool", pos=position)
     if payload > 0.0:
         load = body.add_body(name="robotctl_payload", pos=position)
         load.mass = payload
-        load.inertia = [payload * 1e-3] * 3
+        load.ipos = [0.0, 0.0, 0.0]  # MuJoCo's own default is the body's place in its parent
+        load.inertia = [payload * PAYLOAD_GYRATION] * 3
         load.explicitinertial = True
 
 

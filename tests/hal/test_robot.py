@@ -115,3 +115,9 @@ def test_overrides_are_validated_like_the_file() -> None:
 
 def test_the_stopping_time_is_published(robot: Robot) -> None:
     assert 0.05 < robot.stopping_time_s < 0.5
+
+
+def test_more_than_the_payload_cannot_be_missing() -> None:
+    load_robot("panda", ["payload=1.0", "twin.payload=-1.0"])
+    with pytest.raises(ConfigError, match=r"twin.payload: -1.1 kg takes away more than the payload of 1.0 kg"):
+        load_robot("panda", ["payload=1.0", "twin.payload=-1.1"])

@@ -111,3 +111,20 @@ def test_a_jammed_joint_stands_however_light_it_is() -> None:
     plant.jam(6, jammed=False)
     plant.advance(2_000_000_000)
     assert plant.axis(6).position == pytest.approx(where + 0.4, abs=0.02)
+
+
+def test_the_known_payload_hangs_at_the_tool_point_as_the_model_has_it(robot: Robot) -> None:
+    loaded = load_robot(robot.profile.name, ["payload=2.0"])
+    plant, kinematics, home = Plant(loaded), Kinematics(loaded), np.array(loaded.profile.home)
+    plant.place(home)
+    load = kinematics.gravity(home) - Kinematics(robot).gravity(home)
+    _, jacobian = kinematics.tool_and_jacobian(home)
+    assert load == pytest.approx(2.0 * 9.81 * jacobian[2], abs=1e-9)
+    assert plant.data.qfrc_bias[: loaded.dof] == pytest.approx(kinematics.gravity(home), abs=0.01)
+
+
+@pytest.mark.parametrize("error", [-1.0, 0.5])
+def test_the_twins_payload_is_what_the_controller_is_not_told(error: float) -> None:
+    told = Plant(load_robot("panda", [f"payload={1.0 + error}"]))
+    untold = Plant(load_robot("panda", ["payload=1.0", f"twin.payload={error}"]))
+    assert untold.model.body_mass.sum() == pytest.approx(told.model.body_mass.sum())
