@@ -81,7 +81,7 @@ class Kinematics:
         return np.array(pin.crba(self.model, self._data, position))
 
     def bias(self, position: Vector, velocity: Vector) -> Vector:
-        """Return the torques (n,) that keep the velocities constant, Nm: Coriolis, centrifugal, gravity, no friction."""
+        """Return the torques (n,) that keep the velocities constant, Nm: Coriolis, centrifugal and gravity."""
         return np.array(pin.nonLinearEffects(self.model, self._data, position, velocity))
 
     def coriolis(self, position: Vector, velocity: Vector) -> Vector:

@@ -87,7 +87,8 @@ class TorqueShaper:
             wanted: torque to come as close to as the limits allow (n,), Nm, finite.
         """
         inertia, load = self._dynamics(state)
-        return self._closest(state, wanted, np.linalg.inv(inertia), load)
+        mobility = np.asarray(np.linalg.inv(inertia), dtype=np.float64)
+        return self._closest(state, wanted, mobility, load)
 
     def _dynamics(self, state: ArmState) -> tuple[Vector, Vector]:
         """Return M (n, n) and h - r (n,), so that M a + h - r is the mean torque of a servo period."""

@@ -70,14 +70,14 @@ def _no_number(_bench: Bench, _values: np.ndarray, _axis: int) -> float:
 
 def _shaper_that_does_not_stop(bench: Bench) -> Planted:
     """The shaper forgets the soft limits: what the limiter made smooth goes out as it is."""
-    shaper = bench.loop._motion._shaper  # the bug is planted where it would be
-    edge = shaper._edge.copy()
-    shaper._edge = edge + 1.0
-    shaper._free = shaper._free + 1.0
+    box = bench.loop._motion._shaper._box  # the bug is planted where it would be
+    edge = box._edge.copy()
+    box._edge = edge + 1.0
+    box._free = box._free + 1.0
 
     def undo() -> None:
-        shaper._edge = edge
-        shaper._free = shaper._free - 1.0
+        box._edge = edge
+        box._free = box._free - 1.0
 
     return Planted(undo, lambda: bench.loop._motion.command is not None)
 
