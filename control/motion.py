@@ -67,6 +67,7 @@ class Motion:
             reference.resync(sample.position, sample.velocity)
         self.wanted, self.clip = wanted, Clip.NONE
         self._before = reference.mark()
+        reference.observe(self.observer.external, sample.velocity)
         # What is no longer heard of is taken to be where it was led: an old error must not drive the integrator.
         stale = sample.stamp_ns - int(sample.joint_stamp_ns.min()) > self._stale_ns
         for _ in range(periods):
