@@ -146,7 +146,10 @@ class Loop:
         self._guard.observe(sample, now, self.lateness_ns)
         tool = self.kinematics.tool(sample.position)
         motion.observer.step(sample)
-        supervisor.observe(sample, tool, motion.reference.position, motion.reference.velocity, now)
+        reference = motion.reference
+        supervisor.observe(sample, tool, reference.position, reference.velocity, motion.observer.external, now)
+        if supervisor.yields and supervisor.contact.touched:
+            motion.give_way(sample)
         target = self._link.mailbox.take()
         if target is not None:
             supervisor.offer(target, now)

@@ -21,6 +21,10 @@ from robotctl.safety.torque import ArmState, TorqueShaper
 from robotctl.safety.trip import Trip
 
 
+_AT_REST = 1e-3
+"""Reference speed at which an arm that was stopped may begin to give way, rad/s."""
+
+
 class Motion:
     """Makes one command per tick. `wanted`, `clip` and `command` tell of the last one."""
 
@@ -45,6 +49,9 @@ class Motion:
         self._torque_shaper = TorqueShaper(robot, kinematics, self.scene)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
+        self._gives_way = False
+        self._yielding = robot.profile.safety.reset_scale * robot.limits.velocity * robot.period_ns * 1e-9
+        """Way of a servo period in which an arm gives way (n,), rad."""
         self._stale_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
         self._refuse_forbidden_poses(robot)
 
@@ -67,13 +74,24 @@ class Motion:
             reference.resync(sample.position, sample.velocity)
         self.wanted, self.clip = wanted, Clip.NONE
         self._before = reference.mark()
-        reference.observe(self.observer.external, sample.velocity)
         # What is no longer heard of is taken to be where it was led: an old error must not drive the integrator.
         stale = sample.stamp_ns - int(sample.joint_stamp_ns.min()) > self._stale_ns
+        if not stale and not self._gives_way:  # a load is carried; what the arm gives way to is no load
+            reference.observe(self.observer.external, sample.velocity)
+        self._gives_way = False
         for _ in range(periods):
             velocity = self._shape(wanted, brake)
             self.command = reference.step(velocity, reference.position if stale else sample.position)
         return self.command
+
+    def give_way(self, sample: Sample) -> None:
+        """Lead the arm slowly towards where it is pushed, so that its gains do not press against what it touches."""
+        self._gives_way = True
+        reference, most = self.reference, self._yielding
+        if np.abs(reference.velocity).max() > _AT_REST:
+            return  # it brakes first
+        way = np.minimum(np.maximum(sample.position - reference.position, -most), most)
+        reference.resync(reference.position + way, self.rest)
 
     def take_back(self) -> None:
         """Go back to before the last command of `track`: it did not leave."""

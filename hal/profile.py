@@ -205,6 +205,10 @@ class Safety(_Strict):
     """Multiple of a velocity cap at which three samples stop the arm."""
     overspeed_cut: Annotated[float, Field(gt=1.0)] = 1.5
     """Multiple of a velocity cap at which its torque is taken away."""
+    contact: Annotated[float, Field(gt=0.0, le=1.0)] = 0.35
+    """Torque from outside, as a share of a joint's torque cap, that counts as contact ..."""
+    contact_time_s: Positive = 0.02
+    """... if it lasts for so long."""
     bump: Positive = 0.02
     """How far from the measured pose the first command after enabling may be, rad."""
     track_step: Annotated[float, Field(gt=0.0, le=1.0)] = 0.6

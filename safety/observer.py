@@ -15,6 +15,10 @@ _GAIN = 200.0
 """1/s. A velocity that is wrong by dv shows in the residual as up to K M dv."""
 
 
+_LONGEST_S = 0.01
+"""Time between two samples over which torques are not followed any more, s: the residual stays, and starts anew."""
+
+
 class Dynamics(Protocol):
     """What has to be known of the arm's dynamics. Arrays are (n,), of matrices (n, n)."""
 
@@ -51,8 +55,10 @@ class MomentumObserver:
         model, position, velocity = self._model, sample.position, sample.velocity
         momentum = model.mass_matrix(position) @ velocity
         own = model.coriolis(position, velocity).T @ velocity - model.gravity(position) - model.damping * velocity
-        if self._before is not None:
-            elapsed = 1e-9 * (sample.joint_stamp_ns - self._stamps)
+        elapsed = 1e-9 * (sample.joint_stamp_ns - self._stamps)
+        if self._before is not None and elapsed.max() < _LONGEST_S:
+            if elapsed.min() <= 0.0:
+                return self.external  # a joint was not heard of: its momentum would be made up
             expected, own_before = self._before
             # The trapezoidal rule: with the model at one end only, the residual would be off by dt/2 of its change.
             expected = expected + elapsed * (sample.effort + 0.5 * (own_before + own))

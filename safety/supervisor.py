@@ -10,6 +10,7 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
 from robotctl.safety.admission import Admission
 from robotctl.safety.believable import Believable
+from robotctl.safety.contact import ContactReflex
 from robotctl.safety.deadman import Deadman
 from robotctl.safety.drives import BusHealth, DriveHealth
 from robotctl.safety.machine import ENABLED, Event, Refused, State, after
@@ -53,6 +54,7 @@ class Supervisor:
         self.deadman = Deadman(robot)
         self.bus = BusHealth()
         self.drives = DriveHealth(robot)
+        self.contact = ContactReflex(robot)
         self._believable = Believable(robot)
         self._position = PositionBreach(robot)
         self._sphere = SphereBreach(robot)
@@ -143,7 +145,9 @@ class Supervisor:
             self._believable.forget()
         return self._believable.screen(sample)
 
-    def observe(self, sample: Sample, tool: Vector, position: Vector, velocity: Vector, now_ns: int) -> None:
+    def observe(
+        self, sample: Sample, tool: Vector, position: Vector, velocity: Vector, external: Vector, now_ns: int
+    ) -> None:
         """Judge a sample: trips, standstill, automatic clearing.
 
         Args:
@@ -151,6 +155,7 @@ class Supervisor:
             tool: measured tool point (3,), m.
             position: where the drives are led (n,), rad.
             velocity: how they are led (n,), rad/s.
+            external: torque that acts beside the drives (n,), Nm.
             now_ns: the present time.
         """
         silent = self.feedback.check(sample, now_ns)  # in every state: an arm is damped with the drives on, too
@@ -167,8 +172,7 @@ class Supervisor:
             self.bus.check(sample),
             self._believable.check(now_ns),
             self.drives.check(sample),
-            self._tracking.check(sample, position, velocity),
-            self._drift.check(sample, holding=self.state is State.HOLD),
+            self.contact.check(external, sample.stamp_ns),
             fast,
             self._tool_speed.check(tool, sample.stamp_ns, slow=self.state is State.RESET),
         ]
@@ -194,6 +198,11 @@ class Supervisor:
         outside = not self._position.inside(sample.position) or self._sphere.outside(tool) > 0.0
         if outside or self._proximity.check(sample.position, sample.stamp_ns) is not None:
             self.recovery = True
+
+    @property
+    def yields(self) -> bool:
+        """Whether the arm stopped for a contact, so that it gives way rather than press on."""
+        return self.cause is not None and self.cause.protection is Protection.CONTACT
 
     def stands(self, sample: Sample) -> bool:
         """Return whether every joint was measured at rest."""

@@ -7,7 +7,7 @@ from robotctl.control.kinematics import Kinematics
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Sample
 from robotctl.safety.protections import FeedbackAge, PositionBreach, SphereBreach
-from robotctl.safety.torque import StoppableMotion
+from robotctl.safety.stoppable import StoppableMotion
 from robotctl.safety.trip import Category, Protection
 
 STEPS = [-1e-3, -1e-6, -1e-9, 1e-9, 1e-6, 1e-3, 1.0]
@@ -150,7 +150,7 @@ def test_a_measurement_that_is_no_number_is_never_fine(field: str) -> None:
     bad = np.array(getattr(sample, field))
     bad[3] = np.nan
     sample = sample._replace(**{field: bad})
-    assert StoppableMotion(robot, Kinematics(robot)).check(sample) is not None
+    assert StoppableMotion(robot, Kinematics(robot)).check(sample.position, sample.velocity, 0) is not None
     if field == "position":
         assert PositionBreach(robot).check(sample) is not None
         assert SphereBreach(robot).check(np.array([np.nan, 0.0, 0.0]), 0) is not None

@@ -257,7 +257,7 @@ class Watched:
         home[0] = clearance
         at_centre = np.array(a_robot().profile.sphere.centre)
         self.supervisor.admission.renew(0)
-        self.supervisor.observe(sample(home, np.zeros(7)), at_centre, home, np.zeros(7), 0)
+        self.supervisor.observe(sample(home, np.zeros(7)), at_centre, home, np.zeros(7), np.zeros(7), 0)
         return [(trip.protection, trip.category) for trip in self.supervisor.trips]
 
 

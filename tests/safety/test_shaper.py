@@ -74,7 +74,7 @@ def test_random_states_at_the_surface_and_twice_the_cap(robot: Robot) -> None:
             braked += 1
             assert sphere.room(tool) < 1e-5
             continue
-        reference = closest(wanted, *shaper._box(pose, rest), [row])
+        reference = closest(wanted, *shaper._box.bounds(pose, rest), [row])
         assert np.linalg.norm(best - wanted) <= np.linalg.norm(reference - wanted) + 1e-6
         bound += bool(clip & Clip.SPHERE)
     assert bound > 0.2 * STATES
@@ -99,12 +99,12 @@ def test_random_states_between_a_table_and_a_box(robot: Robot, keep_outs) -> Non
         best, clip = shaper.step(pose, rest, wanted, tool, jacobian)
         assert not clip & Clip.PREDICTED_STOP
         rows = [region.row(tool, jacobian) for region in shaper.regions]
-        reference = closest(wanted, *shaper._box(pose, rest), rows)
+        reference = closest(wanted, *shaper._box.bounds(pose, rest), rows)
         assert all(row.normal @ best <= row.bound + 1e-7 for row in rows)
         assert best == pytest.approx(reference, abs=1e-5)
         several += sum(row.normal @ best > row.bound - 1e-7 for row in rows) > 1
         assert bool(clip & Clip.KEEP_OUT) is any(
-            row.normal @ np.clip(wanted, *shaper._box(pose, rest)) > row.bound for row in rows[1:]
+            row.normal @ np.clip(wanted, *shaper._box.bounds(pose, rest)) > row.bound for row in rows[1:]
         )
     assert several > 1
 

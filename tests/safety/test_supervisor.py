@@ -48,6 +48,7 @@ class Bench:
         self.velocity = np.zeros(7)
         self.reference = None
         self.led = None
+        self.external = np.zeros(7)
         self.tool = CENTRE
         self.faults = ()
         self.enabled = True
@@ -61,7 +62,7 @@ class Bench:
         )
         reference = self.position if self.reference is None else self.reference
         velocity = self.velocity if self.led is None else self.led
-        self.supervisor.observe(sample, self.tool, reference, velocity, self.now)
+        self.supervisor.observe(sample, self.tool, reference, velocity, self.external, self.now)
         return self.supervisor.state
 
     def observe_until(self, at_ns):
