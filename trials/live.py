@@ -99,7 +99,7 @@ def live_stop_scenario(
         trial.seen += f", {live.session.state.name}"
 
     run = _patiently(attempt, {label for label, _ in expected.accepted})
-    return Scenario(number, name, f"{provoked}; in real time", str(expected), run, repeats)
+    return Scenario(number, name, f"{provoked}; in real time", str(expected), run, repeats, real_time=True)
 
 
 def live_tolerated_scenario(
@@ -136,7 +136,7 @@ def live_tolerated_scenario(
         trial.require(problem in told if problem else not told, f"of the recording was said: {told or 'nothing'}")
 
     run = _patiently(attempt, set(trips), recorded)
-    return Scenario(number, name, f"{provoked}; in real time", "the run goes on", run)
+    return Scenario(number, name, f"{provoked}; in real time", "the run goes on", run, real_time=True)
 
 
 def _patiently(
