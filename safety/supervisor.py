@@ -28,6 +28,8 @@ _TRIP_EVENTS = {
 _RECOVERABLE = (Protection.POSITION, Protection.SPHERE, Protection.PROXIMITY)
 """After these, acknowledging permits nothing but the retreat."""
 _STANDSTILL_TICKS = 5
+_LED = 1e-6
+"""Speed below which nothing is led any more, rad/s."""
 _RUNAWAY_NS = 100_000_000
 """Longest time for which a damped joint may be too fast."""
 _STOP_ALLOWANCE_S = 0.5
@@ -187,7 +189,7 @@ class Supervisor:
         if found:
             self.trip(min(found, key=lambda trip: trip.category))
         if self.state is State.STOPPING:
-            self._watch_standstill(sample, now_ns)
+            self._watch_standstill(sample, velocity, now_ns)
         else:
             self._stopping_since_ns = None
         if self.state in (State.STOPPING, State.HOLD) and self._was_running:
@@ -242,10 +244,12 @@ class Supervisor:
         self.epoch += 1
         self.category = category
 
-    def _watch_standstill(self, sample: Sample, now_ns: int) -> None:
+    def _watch_standstill(self, sample: Sample, velocity: Vector, now_ns: int) -> None:
         if self._stopping_since_ns is None:
             self._stopping_since_ns = now_ns
-        self._settled = self._settled + 1 if self.stands(sample) else 0
+        # Slow alone is not at rest: braking with bounded jerk may lead a joint back a little after it has stopped.
+        at_rest = self.stands(sample) and bool((np.abs(velocity) < _LED).all())
+        self._settled = self._settled + 1 if at_rest else 0
         # A joint that is not heard of, or that somebody shakes, must not keep a stop from ending.
         overdue = now_ns - self._stopping_since_ns > self._stopping_limit_ns
         if self._settled >= _STANDSTILL_TICKS or overdue:

@@ -72,6 +72,8 @@ class Scenario:
     """Takes robot, backend and seed. May raise: that fails the trial, too."""
     repeats: int = 3
     """With seeds 0, 1, ...: other motions, other moments."""
+    real_time: bool = False
+    """Whether it needs the machine's own clock, and processes."""
 
     @property
     def label(self) -> str:

@@ -342,6 +342,7 @@ def test_a_position_that_is_not_a_number_does_not_pass_for_healthy():
 
 def test_standstill_takes_five_quiet_ticks_in_a_row():
     bench = Bench(State.STOPPING)
+    bench.led = np.zeros(7)
     for quiet in (4, 4, 5):
         bench.velocity[:] = SAFETY.standstill + 1e-6
         assert bench.observe() is State.STOPPING
@@ -368,6 +369,16 @@ def test_one_joint_that_moves_is_not_standstill():
     bench.velocity[6] = -SAFETY.standstill
     for _ in range(20):
         assert bench.observe() is State.STOPPING
+
+
+@pytest.mark.parametrize(("led", "rests"), [(2e-6, False), (-2e-6, False), (5e-7, True), (0.0, True)])
+def test_an_arm_that_is_still_led_does_not_stand(led, rests):
+    bench = Bench(State.STOPPING)
+    bench.led = np.zeros(7)
+    bench.led[2] = led
+    for _ in range(5):
+        bench.observe()
+    assert (bench.supervisor.state is State.HOLD) is rests
 
 
 def test_a_harder_stop_waits_for_a_standstill_of_its_own():

@@ -3,6 +3,7 @@
 from robotctl.hal.robot import Robot
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.scenarios import (
+    bereft,
     bus,
     configuration,
     guarded,
@@ -11,10 +12,25 @@ from robotctl.trials.scenarios import (
     measured,
     operator,
     policy,
+    processes,
     proximity,
+    weights,
 )
 
-_MODULES = (limits, guarded, measured, policy, machine, bus, operator, proximity, configuration)
+_MODULES = (
+    limits,
+    guarded,
+    measured,
+    policy,
+    machine,
+    bus,
+    operator,
+    proximity,
+    configuration,
+    weights,
+    processes,
+    bereft,
+)
 
 
 def scenarios(robot: Robot, backend: str) -> list[Scenario]:

@@ -60,8 +60,7 @@ def _too_strong(bench: Bench, _values: np.ndarray, axis: int) -> float:
 
 
 def _too_sudden(bench: Bench, values: np.ndarray, axis: int) -> float:
-    largest = float(bench.robot.limits.torque[axis])
-    return float(values[axis]) + (0.9 if values[axis] < 0.0 else -0.9) * largest
+    return (1.0 if values[axis] < 0.0 else -1.0) * 0.98 * float(bench.robot.limits.torque[axis])
 
 
 def _no_number(_bench: Bench, _values: np.ndarray, _axis: int) -> float:
@@ -172,7 +171,7 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         ),
         bug(Protection.ACCELERATION, "guard, step", "20 times an acceleration cap", _garbled("velocity", _too_hard)),
         bug(Protection.TORQUE, "guard, torque", "2 % above a torque cap", _garbled("effort", _too_strong)),
-        bug(Protection.TORQUE, "guard, torque rate", "0.9 of a torque cap at once", _garbled("effort", _too_sudden)),
+        bug(Protection.TORQUE, "guard, torque rate", "from one torque to nearly the cap on the other side", _garbled("effort", _too_sudden)),
         bug(Protection.FRAMES, "burst", "a command goes out 300 times at once", _burst),
         stop_scenario(
             21,

@@ -161,6 +161,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         rest_s=_CRASH_REST_S,
         excused=frozenset({"velocity"}),
     )
+    crash = replace(led_away, or_else=((Protection.OVERSPEED, Category.BRAKE_OFF),))
     astray = replace(
         led_away,
         excused=frozenset({"velocity", "position", "sphere"}),
@@ -188,7 +189,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         stop_scenario(12, "taking turns", "one drive at a time is heard of", _taking_turns, silent),
         stop_scenario(12, "power lost", "a drive loses its supply", lambda b: unpowered(b, [_some(b)]), dead),
         resuming_scenario(12, "short gap", "no drive is heard of for 30 ms", _all_mute, 0.03),
-        stop_scenario(17, "stuck joint", "the fastest joint seizes up", stuck, led_away),
+        stop_scenario(17, "stuck joint", "the fastest joint seizes up", stuck, crash),
         stop_scenario(17, "wrong direction", "a drive pushes the wrong way", _wrong_way, astray),
         stop_scenario(17, "limp drive", "a drive that is on gives no torque", _limp, astray),
         stop_scenario(17, "runaway", "a drive turns with 30 % of its torque by itself", _runaway, astray),

@@ -1,0 +1,89 @@
+"""Emulated motors in a process of their own: `robotctl emulate` on a pseudo-terminal, with a log of every frame."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import can
+
+from robotctl.hal.can.damiao.codec import Special
+from robotctl.hal.errors import HardwareError
+
+_START_S = 30.0
+_POLL_S = 0.05
+_LOST = re.compile(r"(\S+): ENABLED -> COMMUNICATION_LOST, (\d+) ms after the last frame")
+_OFF = re.compile(r"(\S+): ENABLED -> ")
+
+
+class Heard(NamedTuple):
+    """A frame that reached a joint's drive."""
+
+    at_s: float
+    """By the drives' own clock."""
+    motor: int
+    kind: str
+    """track, damp, or the special command's name."""
+
+
+class Emulator:
+    """The motors of a robot. End it before the frames are asked for: then its log is complete."""
+
+    def __init__(self, folder: Path, robot: str, joints: int) -> None:
+        self._joints = joints
+        self._told = folder / "emulate.log"
+        self._frames = folder / "bus.log"
+        command = [sys.executable, "-m", "robotctl.cli.main", "emulate", "--robot", robot, "--log", str(self._frames)]
+        with self._told.open("w") as output:
+            self._process = subprocess.Popen(command, stdout=output, stdin=subprocess.DEVNULL)
+
+    def __enter__(self) -> Self:
+        deadline = time.monotonic() + _START_S
+        while "channel: " not in self._told.read_text():
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                self.end()
+                raise HardwareError("the emulated motors did not come up", "run robotctl emulate")
+            time.sleep(_POLL_S)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+    @property
+    def channel(self) -> str:
+        """Where it serves."""
+        return self._told.read_text().split("channel: ")[1].split()[0]
+
+    def end(self) -> None:
+        """End it. Harmless when it has ended."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+        self._process.wait()
+
+    def off(self) -> set[str]:
+        """Return the names of the drives that went off so far, for whatever reason."""
+        return set(_OFF.findall(self._told.read_text()))
+
+    def lost(self) -> dict[str, float]:
+        """Return for each drive whose watchdog has bitten how long after the last frame, s."""
+        return {name: 1e-3 * int(ms) for name, ms in _LOST.findall(self._told.read_text())}
+
+    def heard(self) -> list[Heard]:
+        """Return what the joints' drives were sent."""
+        return [
+            Heard(frame.timestamp, frame.arbitration_id, _kind(bytes(frame.data)))
+            for frame in can.LogReader(self._frames)
+            if 1 <= frame.arbitration_id <= self._joints
+        ]
+
+
+def _kind(data: bytes) -> str:
+    if data[:7] == b"\xff" * 7:
+        return Special(data[7]).name
+    return "track" if int.from_bytes(data, "big") >> 24 & 0xFFF else "damp"

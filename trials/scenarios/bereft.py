@@ -1,0 +1,95 @@
+"""P13, P27 on CAN: kill -9 of the control process, with the motors in a process of their own."""
+
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from robotctl.hal.errors import HardwareError
+from robotctl.hal.profile import CLASSIC_HZ
+from robotctl.hal.robot import Robot, load_robot
+from robotctl.trials.emulator import Emulator
+from robotctl.trials.live import Live, under_way
+from robotctl.trials.scenario import Scenario, Trial
+
+_REPEATS = 2
+_AFTER_S = 3.5
+"""An arm without brakes is lowered first."""
+
+
+def _control_killed(live: Live) -> None:
+    os.kill(live.pids["control"], signal.SIGKILL)
+
+
+def _both_killed(live: Live) -> None:
+    for part in ("watchman", "control"):
+        os.kill(live.pids[part], signal.SIGKILL)
+
+
+def _taken_over(emulator: Emulator, robot: Robot, trial: Trial) -> None:
+    """Require that every drive was taken before its own watchdog bit, and heard nothing but stops from then on."""
+    frames = emulator.heard()
+    last = max(frame.at_s for frame in frames if frame.kind == "track")
+    after = [frame for frame in frames if frame.at_s > last]
+    motors = {frame.motor for frame in after}
+    first = [min(frame.at_s for frame in after if frame.motor == motor) - last for motor in motors]
+    trial.require(len(motors) == robot.dof, f"only the motors {sorted(motors)} were taken")
+    trial.require({frame.kind for frame in after} <= {"damp", "DISABLE"}, "something else than a stop was sent")
+    trial.require(not emulator.lost(), f"their own watchdogs had to act: {emulator.lost()}")
+    trial.figures["reaction_s"] = max(first, default=float("inf"))
+    trial.seen = "P27: the watchman switched the drives off"
+
+
+def _off_by_themselves(emulator: Emulator, robot: Robot, trial: Trial) -> None:
+    """Require that every drive's own watchdog acted."""
+    lost = {name: after for name, after in emulator.lost().items() if name != "gripper"}
+    trial.require(len(lost) == robot.dof, f"only {len(lost)} of {robot.dof} watchdogs acted")
+    trial.figures["reaction_s"] = max(lost.values(), default=float("inf"))
+    trial.seen = "drives off by themselves"
+
+
+def _bereft_scenario(
+    number: int,
+    name: str,
+    provoked: str,
+    kill: Callable[[Live], None],
+    judge: Callable[[Emulator, Robot, Trial], None],
+) -> Scenario:
+    def run(robot: Robot, backend: str, seed: int) -> Trial:
+        trial = Trial()
+        overrides = (f"servo_hz={CLASSIC_HZ}",)  # the adapter carries classic CAN
+        slow = load_robot(str(robot.source), overrides)
+        with tempfile.TemporaryDirectory() as folder:
+            emulator = Emulator(Path(folder), str(robot.source), robot.dof)
+            with (
+                emulator,
+                suppress(HardwareError),
+                under_way(slow, backend, seed, lambda: emulator.channel, overrides) as live,
+            ):
+                # Leaving it raises what has become of the control process.
+                trial.require(not live.session.trips, f"stopped before: {live.session.trips}")
+                kill(live)
+                time.sleep(_AFTER_S)
+            judge(emulator, robot, trial)
+            timeout = robot.profile.safety.drive_timeout_s
+            late = trial.figures["reaction_s"]
+            trial.require(late <= timeout, f"off after {1e3 * late:.0f} ms instead of {1e3 * timeout:.0f}")
+            trial.require(len(emulator.off() - {"gripper"}) == robot.dof, "not every drive went off")
+        return trial
+
+    expected = "every drive off, in the time of its watchdog"
+    return Scenario(number, name, f"{provoked}; in real time", expected, run, _REPEATS, real_time=True)
+
+
+def scenarios(_robot: Robot, backend: str) -> list[Scenario]:
+    if backend != "can":
+        return []
+    return [
+        _bereft_scenario(
+            13, "control and watchman killed", "kill -9 of control and watchman", _both_killed, _off_by_themselves
+        ),
+        _bereft_scenario(27, "control killed", "kill -9 of the control process", _control_killed, _taken_over),
+    ]
