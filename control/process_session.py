@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from robotctl.control import registry
@@ -111,7 +112,9 @@ class ProcessSession(Session):
             if time.monotonic() > deadline:
                 raise HardwareError("the control process did not come up", "run robotctl doctor")
             if self._watchman is not None and self._watchman.poll() is not None:
-                self._check()  # it ends with the control process, which then knows why
+                with suppress(subprocess.TimeoutExpired):  # which it follows, a little before this process learns of it
+                    self._process.wait(1.0)
+                self._check()
                 raise HardwareError("the watchman ended before anything had begun", "run robotctl doctor")
             time.sleep(0.01)
         self.poll()

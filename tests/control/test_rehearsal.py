@@ -13,8 +13,8 @@ from robotctl.control.session import LockstepSession, Stopped
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.machine import State
 
-POST = "keep_out=[{kind: box, name: post, centre: [0.45, 0.22, 0.2], half: [0.1, 0.02, 0.25]}]"
-"""A post between home and where the first joint has turned to the left."""
+WALL = "keep_out=[{kind: box, name: wall, centre: [0.63, 0.22, 0.45], half: [0.3, 0.02, 0.6]}]"
+"""A wall between home and where the first joint has turned to the left."""
 
 
 def beside(robot: Robot, turn: float) -> np.ndarray:
@@ -44,9 +44,10 @@ def test_it_takes_as_long_as_the_arm_itself(panda: Robot) -> None:
 
 
 def test_a_way_that_is_barred_is_found_out() -> None:
-    robot = load_robot("panda", [POST])
+    robot = load_robot("panda", [WALL])
     found = rehearse(robot, beside(robot, 0.9), Verb.HOME)
-    assert found.objection == "it got no further, held back by PROXIMITY"
+    assert found.objection.startswith("it got no further, held back by ")
+    assert "PROXIMITY" in found.objection
     assert sum(found.violations.values()) == 0
     assert found.duration_s < 60.0
 
@@ -95,7 +96,7 @@ def session(
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("session", [(0.9, POST)], indirect=True)
+@pytest.mark.parametrize("session", [(0.9, WALL)], indirect=True)
 def test_nothing_moves_where_the_rehearsal_fails(session: ProcessSession) -> None:
     pages: list[str] = []
     session.on_page = pages.append

@@ -12,7 +12,7 @@ from robotctl.safety.routines import Goto
 
 HOME = [0.0, -0.4, 0.0, -2.2, 0.0, 1.9, 0.785]
 VIA = [[0.3, *HOME[1:]], [0.3, -0.2, *HOME[2:]]]
-POST = "keep_out=[{kind: box, name: post, centre: [0.45, 0.22, 0.2], half: [0.1, 0.02, 0.25]}]"
+WALL = "keep_out=[{kind: box, name: wall, centre: [0.63, 0.22, 0.45], half: [0.3, 0.02, 0.6]}]"
 """Between home and where the first joint has turned to the left."""
 BESIDE = f"twin.start={[0.9, *HOME[1:]]}"
 
@@ -72,7 +72,7 @@ def test_a_reset_that_never_arrives_is_tried_three_times_then_holds_and_calls_fo
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Goto, "timeout_s", 4.0)
-    session = armed(POST, BESIDE)
+    session = armed(WALL, BESIDE)
     called: list[str] = []
     session.on_page = called.append
     began = session.clock.now_ns()

@@ -63,8 +63,11 @@ def test_one_key_is_the_emergency_stop(tmp_path: Path, key: bytes) -> None:
     run = subprocess.Popen(command, stdin=slave, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     os.close(slave)
     time.sleep(4.0)
-    os.write(master, key)
-    output, _ = run.communicate(timeout=30)
+    deadline = time.monotonic() + 30.0
+    while run.poll() is None and time.monotonic() < deadline:  # before the run listens, a key is lost
+        os.write(master, key)
+        time.sleep(0.5)
+    output, _ = run.communicate(timeout=1.0)
     os.close(master)
     assert run.returncode == 3, output
     trip = json.loads(report.read_text())["safety"]["trips"][0]

@@ -157,5 +157,5 @@ def test_the_scene_is_set_right_before_every_episode():
         states = [event["state"] for event in session.link.events.since(0)[0] if event["type"] == "state"]
     assert outcome.stopped == ""
     between = "-".join(states).split("RUN")
-    # Home, scene, home; after the first episode home, scene, home; after the last one only parking.
-    assert [part.count("RESET") for part in between] == [3, 3, 1]
+    # It wakes up at home; scene, home; after the first episode home, scene, home; after the last one only parking.
+    assert [part.count("RESET") for part in between] == [2, 3, 1]

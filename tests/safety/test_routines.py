@@ -305,6 +305,11 @@ def test_random_starts_follow_their_seed(robot: Robot, kinematics: Kinematics):
     assert RandomStart(robot, 7, kinematics).name == "random start 7"
 
 
+def test_the_pose_of_a_seed_stays_the_same_in_later_versions(panda: Robot):
+    first = panda.profile.home + np.random.default_rng(3).uniform(-0.2, 0.2, panda.dof)
+    assert np.array_equal(drawn(panda, 3, Kinematics(panda)), first)
+
+
 def test_random_starts_fill_the_box_around_home(panda: Robot):
     kinematics = Kinematics(panda)
     away = np.array([drawn(panda, seed, kinematics) for seed in range(200)]) - panda.profile.home
@@ -351,21 +356,25 @@ def test_a_random_start_is_led_to(panda: Robot):
     assert positions[-1] == pytest.approx(drawn(panda, 5, kinematics), abs=2e-3)
 
 
-class Wall:
-    """One pair, with clearance where the first joint is turned to the left."""
+class Apart:
+    """A scene with one pair, always as far apart."""
 
     pairs = (("link", "wall"),)
 
-    def __init__(self, robot: Robot):
-        self.home = robot.profile.home[0]
-        self.reach = np.zeros((1, robot.dof))
+    def __init__(self, dof: int, clearance: float):
+        self.reach = np.zeros((1, dof))
+        self.clearance = clearance
 
     def measure(self, position, pairs):
-        return np.array([position[0] - self.home])[list(pairs)]
+        return np.full(len(pairs), self.clearance)
 
 
-def test_random_starts_keep_links_apart(panda: Robot):
-    kinematics, safety = Kinematics(panda), panda.profile.safety
-    clear = safety.proximity_stop + safety.proximity_margin + 2e-3
-    away = [RandomStart(panda, seed, kinematics, Wall(panda))._pose[0] - panda.profile.home[0] for seed in range(200)]
-    assert clear <= min(away) < clear + 5e-3
+@pytest.mark.parametrize(("short", "good"), [(-1e-6, True), (1e-6, False)])
+def test_random_starts_keep_links_apart(panda: Robot, short: float, good: bool):
+    safety = panda.profile.safety
+    scene = Apart(panda.dof, safety.proximity_stop + safety.proximity_margin + 2e-3 - short)
+    if good:
+        RandomStart(panda, 0, Kinematics(panda), scene)
+    else:
+        with pytest.raises(ConfigError, match="no random start"):
+            RandomStart(panda, 0, Kinematics(panda), scene)

@@ -102,9 +102,12 @@ def test_a_value_that_is_no_number_is_refused_wherever_it_stands(panda: Robot, g
     assert refused(gate, offered) == "a value is not finite"
 
 
-@pytest.mark.parametrize(("age_s", "good"), [(60.0, True), (60.0 + 1e-6, False), (-60.0, True), (-60.0 - 1e-6, False)])
-def test_weights_have_an_age(panda: Robot, gate: WeightsGate, age_s: float, good: bool) -> None:
-    offered = weights(panda, made_ns=NOW - round(age_s * SECOND))
+@pytest.mark.parametrize(
+    ("age_ns", "good"),
+    [(60 * SECOND, True), (60 * SECOND + 1, False), (-60 * SECOND, True), (-60 * SECOND - 1, False)],
+)
+def test_weights_have_an_age(panda: Robot, gate: WeightsGate, age_ns: int, good: bool) -> None:
+    offered = weights(panda, made_ns=NOW - age_ns)
     if good:
         assert gate.offer(offered, NOW) is None
     else:
