@@ -91,7 +91,7 @@ class Shaper:
         self._projects = safety.sphere == "projection"
         self._rowed = self.regions[1:] if self._projects else self.regions
         scene = scene or NothingNear(robot.dof)
-        self._proximity = ProximityLimit(robot, scene, len(_SAMPLES))
+        self._proximity = ProximityLimit(robot, scene)
         self._n = robot.dof
         # Upper and mirrored lower bounds side by side: one vector operation serves both.
         margin = safety.position_margin
