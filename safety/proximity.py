@@ -64,21 +64,25 @@ class NothingNear:
 class Clearances:
     """Lower bounds on the clearances at some poses that move little from one question to the next."""
 
-    def __init__(self, scene: Scene, poses: int) -> None:
+    def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._fade = scene.reach.T.copy()
-        self._poses = np.zeros((poses, len(self._fade)))
-        self._bounds = np.full((poses, len(scene.pairs)), -np.inf)
+        # As long as nothing was measured, nothing is known.
+        self._poses = np.zeros((1, len(self._fade)))
+        self._bounds = np.full((1, len(scene.pairs)), -np.inf)
 
     def at(self, poses: Vector, enough: float | Vector) -> Vector:
-        """Return a bound for every pose (k, n) and pair (k, m), m; those below `enough` are measurements."""
+        """Return a bound for every pose (k, n) and pair (k, m), m; those below `enough` are measurements.
+
+        The poses are to be as many as the time before.
+        """
         bounds = self._bounds - np.abs(poses - self._poses) @ self._fade
         used_up = ~(bounds >= enough)  # in this direction, so that NaN is measured, too
         if used_up.any():
-            for index in range(len(poses)):
+            for index, pose in enumerate(poses):
                 pairs = np.flatnonzero(used_up[index]).tolist()
                 if pairs:
-                    bounds[index, pairs] = self._scene.measure(poses[index], pairs)
+                    bounds[index, pairs] = self._scene.measure(pose, pairs)
         self._poses, self._bounds = np.array(poses), bounds
         return bounds
 
@@ -86,16 +90,15 @@ class Clearances:
 class ProximityLimit:
     """What the shaper keeps: slow where pairs are near, and enough clearance until the arm has stopped."""
 
-    def __init__(self, robot: Robot, scene: Scene, samples: int) -> None:
-        """Watch a reference, and `samples` poses on its way to rest."""
+    def __init__(self, robot: Robot, scene: Scene) -> None:
         safety = robot.profile.safety
         self._stop = safety.proximity_stop + safety.proximity_margin
         self._slow = safety.proximity_slow
         self._gain = safety.sphere_gain
         self._scene = scene
         self._fade = scene.reach.T.copy()
-        self._here = Clearances(scene, 1)
-        self._ahead = Clearances(scene, 1 + samples)
+        self._here = Clearances(scene)
+        self._ahead = Clearances(scene)
 
     def look(self, position: Vector) -> tuple[list[Row], Vector]:
         """Return the rows of the pairs that are near, and what clearance each pair has to keep from here on (m,), m.
@@ -105,10 +108,7 @@ class ProximityLimit:
         clearances = self._here.at(position[np.newaxis], self._slow)[0]
         near = np.flatnonzero(clearances < self._slow).tolist()
         slopes = self._scene.approach(position, near) if near else ()
-        rows = [
-            Row.keeping(clearances[pair] - self._stop, self._gain, slope)
-            for pair, slope in zip(near, slopes, strict=True)
-        ]
+        rows = [Row.keeping(clearances[near[i]] - self._stop, self._gain, slope) for i, slope in enumerate(slopes)]
         return rows, np.minimum(clearances, self._stop) - _ROUNDING
 
     def clear(self, position: Vector, way: Vector, required: Vector) -> bool:
@@ -117,18 +117,13 @@ class ProximityLimit:
         return bool((self._here.at(position[np.newaxis], enough)[0] >= enough).all())
 
     def keeps(self, path: Vector, required: Vector) -> bool:
-        """Return whether every pair keeps its required clearance (m,) all along a path (1 + samples, n).
+        """Return whether every pair keeps its required clearance (m,) all along a path (k, n).
 
         Between two poses a pair has at least the mean of its clearances there less half of what it can move by.
         """
         travel = np.abs(np.diff(path, axis=0)) @ self._fade
-        enough = np.full((len(path), len(required)), required)
         between = required - _BETWEEN
-        np.maximum(enough[1:], between + 0.5 * travel, out=enough[1:])
-        np.maximum(enough[:-1], between + 0.5 * travel, out=enough[:-1])
-        clearances = self._ahead.at(path, enough)
-        if (clearances >= enough).all():
-            return True
+        clearances = self._ahead.at(path, np.maximum(required, between + 0.5 * travel.max(axis=0)))
         means = 0.5 * (clearances[1:] + clearances[:-1] - travel)
         return bool((clearances >= required).all() and (means >= between).all())
 
@@ -139,7 +134,7 @@ class ProximityBreach:
     def __init__(self, robot: Robot, scene: Scene) -> None:
         self._stop = robot.profile.safety.proximity_stop
         self._pairs = scene.pairs
-        self._clearances = Clearances(scene, 1)
+        self._clearances = Clearances(scene)
 
     def check(self, position: Vector, stamp_ns: int) -> Trip | None:
         """Judge measured joint positions (n,)."""

@@ -30,14 +30,14 @@ _SOLVED = (1, 2)
 """daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
 
 
-_SAMPLES = np.arange(1, 9)[:, np.newaxis] / 8
+_SAMPLES = np.linspace(0.125, 1.0, 8)[:, np.newaxis]
 """Where along the time to rest links are looked at on a predicted stop ..."""
 _TOOL = slice(1, None, 2)
-"""... and which of these do for the tool, a point that no thin thing can come between."""
+"""... and which of these do for the tool, whose regions see to what lies between."""
 _ROUNDING = 1e-9
 """m"""
-_SINGULAR = 1e-6
-"""Square of a row's normal below which it moves nothing, m^2."""
+_SINGULAR = 1e-3
+"""Square of a row's normal, (m/rad)^2, below which a way back would ask for too much of the joints."""
 
 
 class ToolModel(Protocol):
@@ -94,7 +94,7 @@ class Shaper:
         self._projects = safety.sphere == "projection"
         self._rowed = self.regions[1:] if self._projects else self.regions
         scene = scene or NothingNear(robot.dof)
-        self._proximity = ProximityLimit(robot, scene, len(_SAMPLES))
+        self._proximity = ProximityLimit(robot, scene)
         self._n = robot.dof
         self._half_dt = 0.5 * self._dt
         self._half_brake = 0.5 / self.acceleration_cap
@@ -177,7 +177,7 @@ class Shaper:
                 wanted = wanted - normal * ((normal @ wanted - bound) / (normal @ normal + _SINGULAR))
         normals = np.array([row.normal for row in rows])
         most = np.concatenate([upper, [max(0.0, row.bound) for row in rows]])
-        least = np.concatenate([lower, np.full(len(rows), -1e30)])
+        least = np.concatenate([lower, np.full(len(rows), -np.inf)])
         for sense in self._senses:
             solution, _, flag, _ = daqp.solve(self._hessian, -wanted, normals, most, least, sense[: len(most)])
             if flag in _SOLVED:
@@ -205,10 +205,10 @@ class Shaper:
         clear = self._proximity.clear(position, way, required)
         if clear and not near:
             return True
-        rest = np.maximum(speed / self.acceleration_cap, 1e-9)
+        rest = speed / self.acceleration_cap
         times = np.minimum(_SAMPLES * rest.max(), rest)
         start = position + self._half_dt * (velocity + following)
-        poses = start + following * times * (1.0 - 0.5 * times / rest)
+        poses = start + times * (following - 0.5 * times * np.copysign(self.acceleration_cap, following))
         if near:
             path = np.array([tool, *(self._tool(pose) for pose in poses[_TOOL])])
             if any(region.along(path) < min(0.0, room) - _ROUNDING for room, region in near):

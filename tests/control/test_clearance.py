@@ -107,7 +107,7 @@ def test_the_answers_are_those_of_measuring_everything(robot: Robot) -> None:
     scene, judge = model_of(robot), model_of(robot)
     measured, measure = [], scene.measure
     scene.measure = lambda position, pairs: measured.extend(pairs) or measure(position, pairs)
-    watch = Clearances(scene, 1)
+    watch = Clearances(scene)
     rng = np.random.default_rng(3)
     short = 0
     for motion in range(20):

@@ -57,7 +57,7 @@ def sample(position: np.ndarray, velocity: np.ndarray) -> Sample:
 
 def test_a_pair_is_measured_again_only_once_its_clearance_may_be_used_up() -> None:
     scene = Lines()
-    watch = Clearances(scene, 1)
+    watch = Clearances(scene)
     first = watch.at(np.zeros((1, 2)), 0.05)[0]
     assert first == pytest.approx([0.1, 0.2, 0.3])
     assert sorted(scene.measured) == [0, 1, 2]
@@ -66,7 +66,7 @@ def test_a_pair_is_measured_again_only_once_its_clearance_may_be_used_up() -> No
         bounds = watch.at(np.array([[-way, 0.0]]), 0.05)[0]
     assert len(scene.measured) == 3 + 1
     assert (bounds <= clearances([0.0, 0.0]) + 1e-12).all()
-    watch = Clearances(scene, 1)
+    watch = Clearances(scene)
     watch.at(np.zeros((1, 2)), 0.05)
     scene.measured.clear()
     assert watch.at(np.array([[0.0499, 0.0]]), 0.05)[0, 0] == pytest.approx(0.0501)
@@ -77,7 +77,7 @@ def test_a_pair_is_measured_again_only_once_its_clearance_may_be_used_up() -> No
 
 def test_every_pose_and_every_pair_has_its_own_bound_and_threshold() -> None:
     scene = Lines()
-    watch = Clearances(scene, 2)
+    watch = Clearances(scene)
     watch.at(np.zeros((2, 2)), 0.0)
     scene.measured.clear()
     poses = np.array([[0.0, 0.0], [0.06, 0.0]])
@@ -89,7 +89,7 @@ def test_every_pose_and_every_pair_has_its_own_bound_and_threshold() -> None:
 
 def test_enough_is_enough() -> None:
     scene = Lines()
-    watch = Clearances(scene, 1)
+    watch = Clearances(scene)
     watch.at(np.zeros((1, 2)), 0.1)
     scene.measured.clear()
     watch.at(np.zeros((1, 2)), 0.1)
@@ -100,14 +100,14 @@ def test_enough_is_enough() -> None:
 
 def test_a_pose_that_is_no_number_is_measured_and_not_remembered() -> None:
     scene = Lines()
-    watch = Clearances(scene, 1)
+    watch = Clearances(scene)
     watch.at(np.zeros((1, 2)), 0.05)
     assert np.isnan(watch.at(np.array([[np.nan, 0.0]]), 0.05)).any()
     assert watch.at(np.zeros((1, 2)), 0.05)[0] == pytest.approx([0.1, 0.2, 0.3])
 
 
 def test_the_caller_may_reuse_its_array() -> None:
-    watch, pose = Clearances(Lines(), 1), np.zeros((1, 2))
+    watch, pose = Clearances(Lines()), np.zeros((1, 2))
     watch.at(pose, 0.05)
     pose[0, 0] = 0.08
     assert watch.at(pose, 0.05)[0, 0] == pytest.approx(0.02)
@@ -116,9 +116,9 @@ def test_the_caller_may_reuse_its_array() -> None:
 # -- limit ----------------------------------------------------------------------------------------------------------
 
 
-def limit(samples: int = 2) -> ProximityLimit:
+def limit() -> ProximityLimit:
     robot = a_robot(f"safety.proximity_slow={SLOW}", f"safety.proximity_margin={MARGIN}")
-    return ProximityLimit(robot, Lines(), samples)
+    return ProximityLimit(robot, Lines())
 
 
 def same(row: Row, normal, bound) -> bool:
@@ -158,7 +158,7 @@ def test_a_path_keeps_what_is_required_at_all_of_its_poses(which: int) -> None:
 @pytest.mark.parametrize("reverse", [False, True])
 def test_between_two_poses_a_pair_may_fall_a_millimetre_short(room, travel, expected, spare, reverse) -> None:
     """The third pair is as near at both, but might be nearer in between by half of what it can move."""
-    watched = limit(1)
+    watched = limit()
     required = np.full(3, KEEPS)
     middle = np.full(2, 0.3 - KEEPS - room - spare)
     apart = (travel + 2.0 * spare) * np.array([0.5, -0.5])
@@ -174,8 +174,30 @@ def test_between_two_poses_a_pair_may_fall_a_millimetre_short(room, travel, expe
     assert scene.measured == ([] if expected else [2, 2])
 
 
+@pytest.mark.parametrize(("spare", "expected"), [(0.0061, True), (0.0059, False)])
+@pytest.mark.parametrize("order", [[0, 1, 2], [0, 2, 1], [1, 2, 0], [2, 1, 0]])
+def test_every_two_poses_in_a_row_count(order: list[int], spare: float, expected: bool) -> None:
+    """One pose far away, one with some clearance to spare, one with none; 8 mm lie between these two."""
+    watched, middle = limit(), np.full(2, 0.3 - KEEPS)
+    watched._scene.offsets = np.array([9.0, 9.0, 0.3])
+    poses = np.array([middle - 0.05, middle - spare, middle + np.array([0.008, -0.008])])
+    assert watched._scene.reach[2] @ np.abs(poses[2] - poses[1]) == pytest.approx(0.008)
+    assert watched.keeps(poses[order], np.full(3, KEEPS)) is expected
+
+
+@pytest.mark.parametrize("ends", [slice(None), slice(None, None, -1)])
+def test_no_path_is_refused_for_what_was_measured_elsewhere(ends: slice) -> None:
+    """The bounds of the first path leave the second enough at its poses, but not between the two that lie apart."""
+    watched, required = limit(), np.full(3, KEEPS)
+    watched._scene.offsets = np.array([9.0, 9.0, 0.3])
+    middle, aside = np.full(2, 0.3 - KEEPS - 0.03), np.array([1.0, -1.0])
+    path = np.array([middle - 0.02 * aside, middle + 0.02 * aside, middle + 0.021 * aside])[ends]
+    assert watched.keeps(path + 0.02 * aside, required)
+    assert watched.keeps(path, required)
+
+
 def test_a_pair_that_is_too_near_may_get_no_nearer() -> None:
-    watched = limit(1)
+    watched = limit()
     here = np.array([0.098, 0.0])
     _, required = watched.look(here)
     assert required == pytest.approx([0.002, KEEPS, KEEPS], abs=3e-5)
@@ -194,9 +216,10 @@ def test_a_way_that_is_short_enough_is_clear_wherever_it_leads(left: float, expe
 
 def test_nothing_is_near_where_there_is_no_geometry(panda: Robot) -> None:
     scene = NothingNear(7)
-    watched = ProximityLimit(panda, scene, 4)
+    watched = ProximityLimit(panda, scene)
     rows, required = watched.look(np.zeros(7))
     assert rows == []
+    assert scene.reach.shape == (0, 7)
     assert watched.clear(np.zeros(7), np.ones(7), required)
     assert watched.keeps(np.full((5, 7), 3.0), required)
     assert ProximityBreach(panda, scene).check(np.zeros(7), STAMP) is None
@@ -389,6 +412,24 @@ def test_where_any_way_of_that_length_would_be_too_long_the_way_to_rest_is_looke
     assert ahead == {round(float(value), 9) for value in expected}
 
 
+def test_links_that_are_clear_anyhow_are_not_looked_at_where_the_tool_is() -> None:
+    """The tool is near the bound of its sphere, and its way to rest is looked at."""
+
+    class AtTheBound(Still):
+        reach = np.full(7, 0.1)
+
+        def tool(self, position):
+            profile = a_robot().profile
+            outward = profile.sphere.radius - profile.safety.sphere_margin - 1e-3
+            return super().tool(position) + np.array([outward, 0.0, 0.0])
+
+    scene = Narrow([0.5, 1.0])
+    tool = AtTheBound()
+    shapes = Shaper(a_robot(), tool, scene)
+    assert shapes.step(HOME, along(0.2), along(0.2), tool.tool(HOME), np.zeros((3, 7))).clip is Clip.NONE
+    assert len(scene.asked) == 1
+
+
 def test_no_pair_is_measured_again_while_it_has_enough_to_spare() -> None:
     scene = Narrow([0.5, 1.0])
     shapes = shaper(scene)
@@ -400,10 +441,18 @@ def test_no_pair_is_measured_again_while_it_has_enough_to_spare() -> None:
 @pytest.mark.parametrize(("clearance", "back"), [(0.006, 0.01), (0.0, 0.04), (-0.002, 0.05), (-0.5, 0.05)])
 def test_links_that_are_too_near_are_led_apart(clearance: float, back: float) -> None:
     shaped = step(shaper(Narrow([clearance, 1.0])), along(-back), along(0.0))
-    assert shaped.velocity == pytest.approx(along(-back), abs=1e-4 * back)
+    assert shaped.velocity == pytest.approx(along(-back), abs=2e-3 * back)
     assert Clip.PROXIMITY in shaped.clip
     faster = along(-back - 1e-3)
     assert step(shaper(Narrow([clearance, 1.0])), faster, faster).velocity is faster
+
+
+@pytest.mark.parametrize("slope", [1.0, 0.1, 0.03, -0.03])
+def test_the_less_a_joint_can_do_the_less_it_is_asked_for(slope: float) -> None:
+    """Damped, since 5 cm/s at the pair would be any speed of a joint that hardly moves it."""
+    scene = Narrow([-0.1, 1.0], {0: [slope, 0.0]})
+    shaped = step(shaper(scene, "joints.0.acceleration=1e9"), along(0.0), along(0.0))
+    assert shaped.velocity == pytest.approx(along(-0.05 * slope / (slope**2 + 1e-3)), rel=1e-6)
 
 
 def test_two_pairs_that_are_too_near_are_led_apart_together() -> None:

@@ -308,6 +308,16 @@ def test_a_step_from_which_braking_would_end_outside_is_not_made(sign, left, bra
         assert shaped.clip is Clip.NONE
 
 
+@pytest.mark.parametrize(("left", "brakes"), [(1e-6, False), (-1e-6, True)])
+def test_one_bound_that_would_be_passed_is_enough(left, brakes):
+    """The wall is; the sphere is near, too, but would not be."""
+    robot = a_robot(SLUGGISH, WALL)
+    offset = 0.2 - robot.profile.safety.sphere_margin - way_to_rest(robot, 0.4) - left
+    assert room(robot, offset) < way_to_rest(robot, 0.4)
+    shaped = step(robot, at(offset), along(0.4, ELSEWHERE), along(0.4, ELSEWHERE))
+    assert (Clip.PREDICTED_STOP in shaped.clip) is brakes
+
+
 def test_as_long_as_the_way_to_rest_is_free_anyhow_it_is_not_looked_at():
     robot = a_robot(SLUGGISH)
     speed = 0.3
