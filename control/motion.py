@@ -20,7 +20,6 @@ from robotctl.safety.stoppable import StoppableMotion
 from robotctl.safety.torque import ArmState, TorqueShaper
 from robotctl.safety.trip import Trip
 
-
 _AT_REST = 1e-3
 """Reference speed at which an arm that was stopped may begin to give way, rad/s."""
 

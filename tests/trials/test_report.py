@@ -67,7 +67,9 @@ def test_a_section_replaces_its_own_and_leaves_the_others(panda: Robot, tmp_path
     assert path.read_text() == after
 
 
-@pytest.mark.parametrize("words", ["| P17 | stuck: a joint seizes up |", "11 / 30", "P25", "-500 mrad", "stopping_time_s"])
+@pytest.mark.parametrize(
+    "words", ["| P17 | stuck: a joint seizes up |", "11 / 30", "P25", "-500 mrad", "stopping_time_s"]
+)
 def test_a_section_has_a_row_per_scenario(panda: Robot, tmp_path: Path, words: str) -> None:
     path = tmp_path / "report.md"
     write_section(path, a_campaign(panda))

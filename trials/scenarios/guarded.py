@@ -171,7 +171,12 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         ),
         bug(Protection.ACCELERATION, "guard, step", "20 times an acceleration cap", _garbled("velocity", _too_hard)),
         bug(Protection.TORQUE, "guard, torque", "2 % above a torque cap", _garbled("effort", _too_strong)),
-        bug(Protection.TORQUE, "guard, torque rate", "from one torque to nearly the cap on the other side", _garbled("effort", _too_sudden)),
+        bug(
+            Protection.TORQUE,
+            "guard, torque rate",
+            "from one torque to nearly the cap on the other side",
+            _garbled("effort", _too_sudden),
+        ),
         bug(Protection.FRAMES, "burst", "a command goes out 300 times at once", _burst),
         stop_scenario(
             21,
