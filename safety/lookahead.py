@@ -51,7 +51,7 @@ class Lookahead:
         usable = (1.0 - robot.profile.safety.cap_margin) * robot.limits.acceleration
         # How long each joint brakes for per rad/s (n,), on the way to each pose.
         self._braking = [np.zeros(robot.dof)] + [1.0 / (share * usable) for share in BRAKE_SHARES]
-        self._proximity = [ProximityLimit(robot, scene or NothingNear(robot.dof), 0) for _ in self._braking]
+        self._proximity = [ProximityLimit(robot, scene or NothingNear(robot.dof)) for _ in self._braking]
 
     def rows(self, position: Vector, velocity: Vector) -> Rows:
         """Return the rows for a motion, joint positions (n,), rad, and velocities (n,), rad/s."""
