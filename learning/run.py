@@ -119,6 +119,7 @@ def _distance(session: Session, goal: Vector) -> float:
 def _may_continue(session: Session, state: State) -> bool:
     if state is State.RUN:
         return True
+    session.poll()  # the trip that led to this state may have come after the last look
     if state not in (State.STOPPING, State.HOLD) or not session.trips:
         return False
     trip = session.trips[-1]

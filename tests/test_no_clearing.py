@@ -56,7 +56,7 @@ def test_the_frame_that_clears_is_made_in_one_place_and_known_to_the_guard() -> 
 
 
 def test_what_is_looked_for_is_found() -> None:
-    assert ("control/loop.py", "_selftest") in mentions("verify")
+    assert ("control/operator.py", "selftest") in mentions("verify")
     assert ("control/publisher.py", "report") in mentions("reaction_ms")
 
 
