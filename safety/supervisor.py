@@ -178,6 +178,9 @@ class Supervisor:
             fast,
             self._tool_speed.check(tool, sample.stamp_ns, slow=self.state is State.RESET),
         ]
+        if not self.yields:
+            trips.append(self._tracking.check(sample, position, velocity))
+            trips.append(self._drift.check(sample, holding=self.state is State.HOLD))
         if not self.recovery:
             near = self._proximity.check(sample.position, sample.stamp_ns)
             trips += [self._position.check(sample), self._sphere.check(tool, sample.stamp_ns), near]

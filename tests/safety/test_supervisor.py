@@ -902,3 +902,28 @@ def test_arming_with_links_too_near_begins_the_recovery(spare, recovers):
     position[0] = SAFETY.proximity_stop + spare
     supervisor.begin_recovery_if_outside(a_sample(0, position), CENTRE)
     assert supervisor.recovery is recovers
+
+
+# -- contact -------------------------------------------------------------------------------------------------------
+
+
+def test_p19_an_arm_that_is_touched_stops_and_gives_way_without_being_judged_for_it():
+    bench = Bench(State.RUN)
+    bench.external[0] = 0.4 * ROBOT.limits.torque[0]
+    for _ in range(11):
+        bench.supervisor.admission.renew(bench.now)
+        assert not bench.supervisor.yields
+        bench.observe()
+    assert [trip.protection for trip in bench.supervisor.trips] == [Protection.CONTACT]
+    assert bench.supervisor.state is State.STOPPING
+    assert bench.supervisor.yields
+    bench.observe_until(bench.now + 200 * MS)
+    assert bench.supervisor.state is State.HOLD
+    bench.reference = bench.position.copy()
+    bench.position = bench.position + 0.1  # as far as a tracking error and a creep would go
+    bench.led = np.full(7, 2.0)
+    for _ in range(50):
+        bench.observe()
+    assert len(bench.supervisor.trips) == 1
+    bench.supervisor.handle(Event.ACK)
+    assert not bench.supervisor.yields

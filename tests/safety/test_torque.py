@@ -150,3 +150,14 @@ def test_where_the_solver_fails_the_arm_brakes(shaper, kinematics, panda, monkey
     torque, _ = shaper.push(moving, moving.effort + 50.0)
     assert (acceleration(kinematics, moving, torque)[:4] < 0.0).all()
     assert (np.abs(torque - moving.effort) <= panda.limits.torque_rate * 2e-3 + 1e-9).all()
+
+
+def test_at_the_centre_of_its_sphere_a_tool_is_free(kinematics):
+    """There is no direction outward there, so no row."""
+    home = middle(PANDA)
+    x, y, z = (float(value) for value in kinematics.tool(home))
+    robot = load_robot("panda", [f"sphere.centre=[{x}, {y}, {z}]"])
+    moving = state(kinematics, home)
+    torque, clip = TorqueShaper(robot, kinematics).push(moving, moving.effort)
+    assert torque is moving.effort
+    assert clip is Clip.NONE
