@@ -25,7 +25,8 @@ class Believable:
         self._kept: Sample | None = None
         self._rejected: int | None = None
         self._refused: deque[int] = deque(maxlen=self._most)
-        self._cause = ""
+        self._cause: str
+        """Of the latest refusal."""
 
     def screen(self, sample: Sample) -> Sample:
         """Return the sample with what can be believed of it."""

@@ -24,7 +24,8 @@ class Deadman:
     def __init__(self, robot: Robot) -> None:
         self._stuck_ns = round(robot.profile.safety.deadman_stuck_s * 1e9)
         self._grip = Grip.NONE
-        self._pressed_ns = 0
+        self._pressed_ns: int
+        """When it began to tell what it tells now."""
         self.permits = True
         """Whether the arm may move."""
 
@@ -32,8 +33,7 @@ class Deadman:
         """Take what the switch tells now. One that is held without end counts as stuck, until it is let go."""
         if grip is not self._grip:
             self._grip, self._pressed_ns = grip, now_ns
-        stuck = now_ns - self._pressed_ns >= self._stuck_ns
-        self.permits = grip is Grip.NONE or (grip is Grip.HELD and not stuck)
+        self.permits = grip is Grip.NONE or (grip is Grip.HELD and now_ns - self._pressed_ns < self._stuck_ns)
 
     def check(self, now_ns: int) -> Trip | None:
         """Trip while the switch does not permit motion: category 2, squeezed 1."""

@@ -62,7 +62,7 @@ class JointGuard:
             standing: whether the arm is to stand still.
         """
         kind, target, speed, kp, kd, effort = asked
-        if not math.isfinite(target + speed + kp + kd + effort):
+        if not all(map(math.isfinite, (target, speed, kp, kd, effort))):
             return self._refusal(Protection.FRAMES, "a value that is no number")
         if kp > self._kp + step.kp or kd > self._kd + step.kd:
             return self._refusal(Protection.FRAMES, f"gains {kp:.1f} and {kd:.2f}, above the profile's")

@@ -12,13 +12,12 @@ class Overrun:
         self._period_ns = robot.period_ns
         self._longest_ns = robot.period_ns + round(safety.overrun_s * 1e9)
         self._most = safety.overrun_ticks
-        self._row = 0
-        self._last_ns: int | None = None
+        self.restart()
 
     def restart(self) -> None:
         """Begin anew after something that takes its time by design, such as enabling the drives."""
         self._row = 0
-        self._last_ns = None
+        self._last_ns: int | None = None
 
     def check(self, lateness_ns: int, now_ns: int) -> Trip | None:
         """Judge the tick that begins at `now_ns`, `lateness_ns` after it was due.

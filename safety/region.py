@@ -183,8 +183,8 @@ class Box(Region):
             distance = length = math.hypot(*away)
         else:  # inside the box, the way out is through the nearest face
             away = [0.0, 0.0, 0.0]
-            away[beyond.index(furthest)] = length = 1.0
-            distance = furthest
+            away[beyond.index(furthest)] = 1.0
+            distance, length = furthest, 1.0
         return distance, [math.copysign(x / length, at) for x, at in zip(away, local, strict=True)]
 
 

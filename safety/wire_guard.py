@@ -84,7 +84,7 @@ class WireGuard:
         self.joints = [WireJoint(drive) for drive in drives]
         self._index = {drive.id: index for index, drive in enumerate(drives)}
         self._motors = set(self._index)
-        self._grip_id = -1
+        self._grip_id: int | None = None
         self._gripper: WireGripper | None = None
         if profile.gripper and profile.gripper.drive:
             drive = profile.gripper.drive
@@ -102,7 +102,7 @@ class WireGuard:
             return self._index.get(arbitration_id)
         if arbitration_id == self._grip_id and self._gripper is not None:
             return Kind.GRIP if self._gripper.fits(data) else None
-        if arbitration_id == BROADCAST_ID and data[0] | data[1] << 8 in self._motors:
+        if arbitration_id == BROADCAST_ID and int.from_bytes(data[:2], "little") in self._motors:
             return _register_kind(data[2], data[3])
         return None
 

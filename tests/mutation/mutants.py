@@ -6,7 +6,7 @@
 | tie        | `<` to `<=`, `>` to `>=`, and back                                                            |
 | logic      | `and` to `or` and back; one operand left out; `not` dropped                                   |
 | arithmetic | `+` to `-`, `*` to `/`, `&` to `|` and back; `**` and `%` to `*`; unary minus and abs dropped |
-| number     | x + 1 for integers, 1.5 x for floats, 1.0 for 0.0, True to False and back                     |
+| number     | x + 1 for integers, 1.5 x for floats and from 1000 on, 1.0 for 0.0, True to False and back    |
 | extremum   | min to max, all to any, and back, and numpy's relatives of these                              |
 | return     | `return X` to `return None`                                                                   |
 | deletion   | a statement that assigns or calls                                                             |
@@ -51,6 +51,8 @@ ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
 EXTREMA = {"min": "max", "minimum": "maximum", "argmin": "argmax", "all": "any"}
 EXTREMA |= {after: before for before, after in EXTREMA.items()}
 MAGNITUDES = {"abs", "fabs"}
+LARGE = 1000
+"""From here on an integer is a quantity, as nanoseconds are."""
 ENUMERATIONS = {"Enum", "IntEnum", "Flag", "IntFlag", "StrEnum"}
 
 Place = tuple[int, int, int | None, int | None]
@@ -177,7 +179,7 @@ def _changes(node: Any, field: str, *, table: bool) -> Iterator[Change]:
         case ast.Constant(value=bool(value)):
             yield Change("number", ast.Constant(not value))
         case ast.Constant(value=int(value)):
-            yield Change("number", ast.Constant(value + 1))
+            yield Change("number", ast.Constant(value + 1 if value < LARGE else value * 3 // 2))
         case ast.Constant(value=float(value)):
             yield Change("number", ast.Constant(1.5 * value or 1.0))
         case ast.Call(func=function) if (name := _name(function)) in EXTREMA:

@@ -40,6 +40,7 @@ def mutated(source):
         ("f(np.abs(a))", {"pass", "f(a)"}),
         ("f(2)", {"pass", "f(3)"}),
         ("f(2.0)", {"pass", "f(3.0)"}),
+        ("f(1_000_000)", {"pass", "f(1_500_000)"}),
         ("f(0.0)", {"pass", "f(1.0)"}),
         ("f(True)", {"pass", "f(False)"}),
         ("f(min(a, b))", {"pass", "f(max(a, b))"}),

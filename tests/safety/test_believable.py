@@ -139,3 +139,27 @@ def test_the_number_comes_from_the_profile():
     screen.screen(sample(0, robot.profile.home))
     assert screen.check(jump(screen, robot, 1)) is None
     assert screen.check(jump(screen, robot, 1, begin=2)) is not None
+
+
+def test_a_first_sample_with_anything_that_is_no_number_is_not_kept(panda: Robot):
+    screen = Believable(panda)
+    screen.screen(sample(0, moved(panda, 3, np.nan)))
+    assert (screen.screen(sample(TICK, panda.profile.home)).position == panda.profile.home).all()
+
+
+def test_a_jump_is_measured_from_the_sample_before_however_long_the_arm_runs(panda: Robot):
+    screen = Believable(panda)
+    for stamp in (10**9, 2 * 10**9):
+        screen.screen(sample(stamp, panda.profile.home))
+    seen = screen.screen(sample(2 * 10**9 + TICK, moved(panda, 3, 1.0)))
+    assert seen.position[3] == panda.profile.home[3]
+
+
+def test_samples_without_complaint_do_not_change_the_cause(panda: Robot):
+    screen = Believable(panda)
+    screen.screen(sample(0, panda.profile.home, rejected=4))
+    for number in range(1, panda.profile.safety.rejected_frames + 1):
+        screen.screen(sample(number * TICK, moved(panda, 3, 1.0), rejected=4))
+    for rejected in (4, 3):
+        screen.screen(sample(9 * TICK, panda.profile.home, rejected=rejected))
+        assert "panda_joint4" in screen.check(9 * TICK).cause

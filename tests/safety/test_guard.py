@@ -336,3 +336,34 @@ def test_the_power_of_all_joints_together_is_bounded(watts, refused):
     assert "W are allowed" in Bench(robot=load_robot("panda", ["safety.power=7.9"])).tick(100 * MS).guard.command(
         Command(CommandMode.TRACK, HOME, velocity, effort)
     )
+
+
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize(("share", "refused"), [(1.0 - 2e-7, False), (1.0 + 2e-7, True)])
+def test_the_time_of_a_motion_is_counted_to_the_nanosecond(first, share, refused):
+    """The first motion has a period, and the next one, too."""
+    bench = Bench()
+    bench.command()
+    bench.tick()
+    if not first:
+        bench.command()
+        bench.tick()
+    change = 1.001 * PANDA.limits.acceleration * PERIOD * 1e-9
+    assert bench.command(velocity=share * change) is (Protection.ACCELERATION if refused else None)
+
+
+@pytest.mark.parametrize(("more", "refused"), [(-1e-12, False), (0.5e-9, True)])
+def test_the_very_first_motion_has_a_period_too(more, refused):
+    """Told by how far off it may begin."""
+    bench = Bench()
+    start = SAFETY.bump + 1.001 * PANDA.limits.velocity[0] * PERIOD * 1e-9 + more
+    assert bench.command(position=HOME + start * np.eye(7)[0]) is (Protection.BUMP if refused else None)
+
+
+def test_a_turn_is_told_by_where_a_joint_is_not_by_how_fast_it_moves():
+    bench = Bench()
+    position, velocity = HOME.copy(), REST.copy()
+    position[0], velocity[0] = 2.5, -0.9
+    bench.guard.observe(Sample(PERIOD, position, velocity, REST, np.full(7, PERIOD)), PERIOD)
+    frames = [joint_frame(0, position=2.5, velocity=-0.9), *(joint_frame(index) for index in range(1, 7))]
+    assert bench.frames(*frames) is None

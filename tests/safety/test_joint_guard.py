@@ -53,7 +53,8 @@ def test_what_is_no_number_is_refused(field, value):
 @pytest.mark.parametrize("step", GRID)
 @pytest.mark.parametrize("resolution", [EXACT, STEP])
 def test_gains_above_the_profiles_are_refused(step, resolution):
-    for gains in ({"kp": KP * (1.0 + step) + resolution.kp}, {"kd": KD * (1.0 + step) + resolution.kd}):
+    most = max(KD, 0.5)  # damping has a floor
+    for gains in ({"kp": KP * (1.0 + step) + resolution.kp}, {"kd": most * (1.0 + step) + resolution.kd}):
         assert ask(guard(track()), track(**gains), resolution) is (Protection.FRAMES if step > 0.0 else None)
 
 
@@ -291,3 +292,16 @@ def test_kinds():
     assert Asked.of(0.0, 0.0, 0.0, 1.0, 0.0).kind is Kind.DAMP
     assert Asked.of(0.0, 0.0, 0.0, 0.0, 1.0).kind is Kind.TORQUE
     assert np.all(np.array(EXACT) == 0.0)
+
+
+@pytest.mark.parametrize(("beyond", "refused"), [(0.9e-6, False), (1.1e-6, True)])
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("index", [1, 3])  # the second has no 0 in the middle of its range
+def test_a_stop_a_micrometre_past_a_soft_limit_is_rounding(index, side, beyond, refused):
+    limits = ROBOT.profile.joints[index]
+    joint = JointGuard(limits, SAFETY)
+    edge = limits.position[1] if side > 0 else limits.position[0]
+    inside = Asked.of(edge - side * 1e-4, 0.0, limits.gains.kp, limits.gains.kd, 0.0)
+    joint.keep(inside)
+    outside = inside._replace(position=edge + side * beyond)
+    assert ask(joint, outside) is (Protection.SOFT_LIMIT if refused else None)

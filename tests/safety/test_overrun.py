@@ -103,3 +103,9 @@ def test_what_takes_its_time_by_design_counts_neither_as_late_nor_as_a_gap(ticks
     ticks.overrun.restart()
     assert not any(ticks.tick(late, gap) for gap in (10**9, None, None, None))
     assert ticks.tick(late) is not None
+
+
+def test_the_first_late_ticks_count_like_any_other(panda: Robot) -> None:
+    overrun, period = Overrun(panda), panda.period_ns
+    trips = [overrun.check(period + 1, BEGIN + number * period) for number in range(TICKS)]
+    assert [trip is not None for trip in trips] == [False] * (TICKS - 1) + [True]

@@ -496,3 +496,21 @@ def test_a_retreat_leads_near_links_apart(clearance: float, apart: bool) -> None
         assert wish[1] < 0.0
         assert not wish[[0, 2, 3, 4, 5, 6]].any()
         assert abs(wish[1]) <= 0.1 * robot.limits.velocity[1] * (1 + 1e-9)
+
+
+def test_between_three_poses_each_way_counts() -> None:
+    """A way that is too long, the first or the second of two, is found by what a pair could do on it."""
+    required = np.full(3, KEEPS)
+    for bent in (0, 1):
+        watched = limit()
+        watched._scene.offsets = np.array([9.0, 9.0, 0.3])
+        near = np.full(2, 0.3 - KEEPS)
+        path = np.array([near, near, near])
+        path[: bent + 1] += 0.0019 * np.array([1.0, -1.0])
+        assert watched.keeps(path, required)
+        path[: bent + 1] += 0.0002 * np.array([1.0, -1.0])
+        assert not watched.keeps(path, required)
+
+
+def test_a_scene_without_pairs_has_no_reach_either() -> None:
+    assert NothingNear(6).reach.shape == (0, 6)

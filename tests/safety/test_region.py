@@ -167,6 +167,9 @@ def test_rotations_are_about_the_fixed_axes_in_the_order_x_y_z() -> None:
     assert rotation(quarter, 0, 0) @ [0, 1, 0] == pytest.approx([0, 0, 1])
     assert rotation(0, quarter, 0) @ [0, 0, 1] == pytest.approx([1, 0, 0])
     assert rotation(0, 0, quarter) @ [1, 0, 0] == pytest.approx([0, 1, 0])
+    assert rotation(quarter, 0, 0) @ [0, 0, 1] == pytest.approx([0, -1, 0])
+    assert rotation(0, quarter, 0) @ [1, 0, 0] == pytest.approx([0, 0, -1])
+    assert rotation(0, 0, quarter) @ [0, 1, 0] == pytest.approx([-1, 0, 0])
     assert rotation(quarter, quarter, 0) @ [0, 1, 0] == pytest.approx([1, 0, 0])
     assert rotation(quarter, 0, quarter) @ [0, 1, 0] == pytest.approx([0, 0, 1])
 
@@ -227,3 +230,10 @@ def test_projection_outside_keeps_an_inward_velocity_and_adds_to_it() -> None:
     velocity = np.array([-0.1, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
     shaped = sphere.project(velocity, tool, np.eye(3, 7), 0.002)
     assert shaped[:2] == pytest.approx([-0.1 - GAIN * 0.02, 0.3], abs=1e-5)
+
+
+def test_the_projections_inverse_is_damped_by_a_millionth() -> None:
+    sphere, outwards = REGIONS["sphere"], np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    tool = sphere.centre + np.array([sphere.radius, 0.0, 0.0])
+    shaped = sphere.project(outwards, tool, np.eye(3, 7), 0.002)
+    assert shaped == pytest.approx(1e-6 * outwards, rel=1e-5)

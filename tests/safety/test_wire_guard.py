@@ -81,6 +81,8 @@ def test_a_joint_that_woke_up_a_turn_off_is_read_where_it_is(turns, gear):
     turn = 2.0 * math.pi / gear
     for measured in (0.3, 0.3 + 0.49 * turn, 0.3 - 0.49 * turn):
         assert wire.asked(data, measured + turns * turn).position == pytest.approx(0.3 + turns * turn, abs=3e-4)
+    for measured, read in ((0.4 * turn, 0.3), (-0.6 * turn, 0.3 - turn), (0.3 + 0.6 * turn, 0.3 + turn)):
+        assert wire.asked(data, measured).position == pytest.approx(read, abs=3e-4)
     # No more than one turn: what is further off is a bump.
     assert wire.asked(data, 0.3 + 2.0 * turn).position == pytest.approx(0.3 + turn, abs=3e-4)
     assert wire.asked(data, math.nan).position == pytest.approx(0.3, abs=3e-4)
@@ -112,6 +114,10 @@ def test_register_frames(command, register, kind):
     assert WIRE.kind(BROADCAST_ID, bytes((1, 1, command, register, 0, 0, 0, 0))) is None
 
 
+def test_what_looks_like_a_register_frame_on_another_id_is_strange():
+    assert WIRE.kind(0x123, encode_register(1, RegisterCommand.READ, 7)) is None
+
+
 def test_every_other_id_is_strange():
     known = {*range(1, 8), GRIP_ID, BROADCAST_ID}
     for arbitration_id in set(range(0x800)) - known:
@@ -128,6 +134,7 @@ def test_frames_of_another_length_are_strange(length):
 
 def test_the_grippers_motor_takes_no_motion_in_mit_mode():
     assert WIRE.kind(GRIPPER.drive.id, MOTION) is None
+    assert WIRE.kind(GRIPPER.drive.id, encode_special(Special.DISABLE)) is Kind.DISABLE
 
 
 def grip(angle=1.0, speed=None, current=None, robot=PANDA):
@@ -159,12 +166,16 @@ def test_the_gripper_is_no_faster_and_no_stronger_than_its_profile():
     assert grip(speed=speed + 0.05) is None
     assert grip(current=1.005) is Kind.GRIP
     assert grip(current=1.05) is None
+    most = GRIPPER.force / PER_METRE / MOTORS[GRIPPER.drive.motor].tmax
+    assert grip(current=(most + 0.9e-3) / most) is Kind.GRIP
+    assert grip(current=(most + 1.3e-3) / most) is None
 
 
 def test_a_grip_force_beyond_the_motors_is_full_current():
     strong = GRIPPER.model_copy(update={"force": 1e6})
     wire = WireGuard(PANDA.profile.model_copy(update={"gripper": strong}))
     assert wire.kind(GRIP_ID, encode_pos_force(PosForceCommand(1.0, 1.0, 1.0))) is Kind.GRIP
+    assert wire.kind(GRIP_ID, bytes(6) + (12_000).to_bytes(2, "little")) is None
 
 
 def test_an_arm_without_a_grippers_motor_has_no_grip():
