@@ -12,6 +12,9 @@ from robotctl.safety.machine import State
 
 DAMPING_S = 0.5
 """Time with all of gravity compensated, in which the motion dies away, before the arm is lowered."""
+_LOST_NS = 250_000_000
+"""Age of a joint's feedback above which the arm is not damped any more. Longer than the loop's, which has a watchman
+behind it: after this nobody is left to keep the arm from falling."""
 
 
 class Rescue:
@@ -25,7 +28,6 @@ class Rescue:
         self._kinematics = Kinematics(robot)
         self._damps = robot.profile.category0 == "damp"
         self._period_ns = robot.period_ns
-        self._lost_ns = round(robot.profile.safety.feedback_fault_s * 1e9)
 
     def run(self, cause: str, onset_ns: int) -> None:
         """Do the profile's category 0 action. The loop's process must be gone: two would fight over the drives.
@@ -63,7 +65,7 @@ class Rescue:
             share = min(1.0, gravity_share(began_ns + round(DAMPING_S * 1e9), now))
             heard = int(sample.joint_stamp_ns.min())
             off = heard >= began_ns and not sample.enabled
-            if share <= 0.0 or off or now - max(heard, began_ns) > self._lost_ns:
+            if share <= 0.0 or off or now - max(heard, began_ns) > _LOST_NS:
                 return
             command = damp(self._kinematics, sample.position, share)
             arm.write(command)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,6 +108,8 @@ class Emulator:
         command = [*ROBOTCTL, "emulate", "--robot", robot, "--log", str(self.frames), *options]
         with self.log.open("w") as output:
             self.process = subprocess.Popen(command, stdout=output)
+        with suppress(PermissionError):  # motors keep time, however busy the host is
+            os.sched_setscheduler(self.process.pid, os.SCHED_FIFO, os.sched_param(1))
         deadline = time.monotonic() + 30.0
         while "channel: " not in self.text:
             assert self.process.poll() is None
