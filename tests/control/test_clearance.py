@@ -165,7 +165,7 @@ def test_a_retreat_brings_links_apart(robot: Robot) -> None:
     """From poses with links too near to each other or overlapping, also outside the sphere, to where they may be."""
     scene, rng = model_of(robot), np.random.default_rng(9)
     keeps = robot.profile.safety.proximity_stop + robot.profile.safety.proximity_margin
-    for _ in range(3):
+    for _ in range(2):
         start = pose_with_clearance(robot, scene, -0.01, 0.004, rng)
         reference = Reference(robot, scene, start)
         routine = Retreat(robot, reference.kinematics, scene)
