@@ -48,7 +48,6 @@ class Motion:
         self._torque_shaper = TorqueShaper(robot, kinematics, self.scene)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
-        self._gives_way = False
         self._yielding = robot.profile.safety.reset_scale * robot.limits.velocity * robot.period_ns * 1e-9
         """Way of a servo period in which an arm gives way (n,), rad."""
         self._stale_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
@@ -75,9 +74,6 @@ class Motion:
         self._before = reference.mark()
         # What is no longer heard of is taken to be where it was led: an old error must not drive the integrator.
         stale = sample.stamp_ns - int(sample.joint_stamp_ns.min()) > self._stale_ns
-        if not stale and not self._gives_way:  # a load is carried; what the arm gives way to is no load
-            reference.observe(self.observer.external, sample.velocity)
-        self._gives_way = False
         for _ in range(periods):
             velocity = self._shape(wanted, brake)
             self.command = reference.step(velocity, reference.position if stale else sample.position)
@@ -85,7 +81,6 @@ class Motion:
 
     def give_way(self, sample: Sample) -> None:
         """Lead the arm slowly towards where it is pushed, so that its gains do not press against what it touches."""
-        self._gives_way = True
         reference, most = self.reference, self._yielding
         if np.abs(reference.velocity).max() > _AT_REST:
             return  # it brakes first

@@ -1,9 +1,8 @@
 """The reference: the motion the drives are led along, and the command that leads them.
 
 One step integrates q' = q + dt (v + v')/2 and feeds the drives forward with the inverse dynamics and friction of
-that motion, less what was observed to act beside the drives, such as a payload that the model does not know. So
-tracking needs little of the gains. What hides in dry friction is found by a slow integrator, which only works at rest:
-while the arm moves, an actuator's lag would wind it up.
+that motion, so that tracking needs little of the gains. What the model does not know, such as a payload, is found
+by a slow integrator, which only works at rest: while the arm moves, an actuator's lag would wind it up.
 """
 
 import numpy as np
@@ -17,9 +16,7 @@ _SLOW = 0.02
 _DEADBAND = 1e-3
 """Position error that the integrator leaves alone, rad: dry friction would make it hunt."""
 _BIAS_SHARE = 0.3
-"""Largest part of a joint's torque that the integrator may use, and as much that may answer an observed load."""
-_LOAD_RATE = 100.0
-"""How fast an observed load is answered, 1/s: slower than it is observed, to leave out its noise."""
+"""Largest part of a joint's torque that the integrator may use."""
 
 
 class Reference:
@@ -32,14 +29,14 @@ class Reference:
         self.acceleration: Vector = np.zeros(n)
         self.effort: Vector = np.zeros(n)
         """Feed-forward of the last command (n,), Nm."""
-        self._load: Vector = np.zeros(n)
-        self._cap = robot.limits.torque
         self._dt = robot.period_ns * 1e-9
         self._kinematics = kinematics
         self._ki = self._dt * np.array([joint.gains.ki for joint in robot.profile.joints])
+        self._cap = robot.limits.torque
         self._bias_cap = _BIAS_SHARE * self._cap
         self._bias = np.zeros(n)
         self._velocity_cap = robot.limits.velocity
+        self._rubs = bool(kinematics.friction.any())
 
     def resync(self, position: Vector, velocity: Vector) -> None:
         """Start anew from a measured state, as after any loss of hold. What the integrator had found is forgotten."""
@@ -47,19 +44,6 @@ class Reference:
         self.velocity = np.minimum(np.maximum(velocity, -self._velocity_cap), self._velocity_cap)
         self.acceleration = np.zeros_like(self.position)
         self._bias = np.zeros_like(self.position)
-
-    def observe(self, external: Vector, velocity: Vector) -> None:
-        """Take what acts on the joints beside their drives (n,), Nm, and how they move (n,), rad/s, both measured.
-
-        Dry friction is part of it: what the model has of that is fed forward anyway, and what may be holding a joint
-        at rest is no load.
-        """
-        sliding = np.tanh(velocity / _SLOW)
-        holding = self._kinematics.friction * (1.0 - np.abs(sliding))
-        load = external + self._kinematics.friction * sliding
-        load = load - np.minimum(np.maximum(load, -holding), holding)
-        load = np.minimum(np.maximum(load, -self._bias_cap), self._bias_cap)
-        self._load = self._load + min(1.0, _LOAD_RATE * self._dt) * (load - self._load)
 
     def mark(self) -> tuple[Vector, ...]:
         """Return what `restore` needs to come back here."""
@@ -81,15 +65,13 @@ class Reference:
         self.position = self.position + (0.5 * dt) * (self.velocity + velocity)
         self.velocity = velocity
         effort = kinematics.inverse_dynamics(self.position, velocity, self.acceleration)
-        effort += kinematics.damping * velocity - self._beside(velocity)
+        effort += kinematics.damping * velocity + self._bias
+        if self._rubs:
+            effort += kinematics.friction * np.tanh(velocity / _SLOW)
         if velocity @ velocity < _SLOW**2:
             self._integrate(measured)
         self.effort = np.minimum(np.maximum(effort, -self._cap), self._cap)
         return Command(CommandMode.TRACK, self.position, velocity, self.effort)
-
-    def _beside(self, velocity: Vector) -> Vector:
-        friction = self._kinematics.friction * np.tanh(velocity / _SLOW)
-        return np.asarray(self._load - self._bias - friction)
 
     def _integrate(self, measured: Vector) -> None:
         error = self.position - measured

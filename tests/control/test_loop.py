@@ -447,7 +447,7 @@ def test_a_push_that_torques_cannot_stop_in_time_hands_over_to_braking(bench):
     bench.reach(State.ARMED)
     assert bench.ask(Verb.START) == ""
     shove = np.zeros(7)
-    shove[6] = 14.0
+    shove[6] = 12.5
     bench.plant.push(shove)
     for _ in range(200):
         bench.put(FreeDrive)
@@ -932,7 +932,8 @@ def test_a_drive_that_gets_hot_is_warned_of_once(bench):
     assert bench.supervisor.state is State.ARMED
 
 
-def test_an_arm_that_is_pushed_stops_and_gives_way(bench):
+def test_an_arm_that_is_pushed_stops_and_gives_way():
+    bench = Bench(load_robot("panda", ["safety.contact=0.15"]))
     bench.reach(State.ARMED)
     assert bench.ask(Verb.START) == ""
     for _ in range(20):
@@ -940,7 +941,7 @@ def test_an_arm_that_is_pushed_stops_and_gives_way(bench):
         bench.tick()
     hand = np.zeros(7)
     for tick in range(300):
-        hand[0] = max(-0.2 * tick, -36.0)
+        hand[0] = max(-0.1 * tick, -14.5)
         bench.plant.push(hand)
         bench.put_velocity(0.2)
         bench.tick()
@@ -950,7 +951,7 @@ def test_an_arm_that_is_pushed_stops_and_gives_way(bench):
     assert bench.truth.position[0] < before - 0.1  # it goes where it is pushed, and slowly
     assert abs(bench.truth.velocity[0]) < 0.4
     for tick in range(500):
-        hand[0] = min(-36.0 + 0.3 * tick, 0.0)
+        hand[0] = min(-14.5 + 0.1 * tick, 0.0)
         bench.plant.push(hand)
         bench.tick()
     assert bench.supervisor.state is State.HOLD
