@@ -937,13 +937,13 @@ def test_an_arm_that_is_pushed_stops_and_gives_way():
     bench.reach(State.ARMED)
     assert bench.ask(Verb.START) == ""
     for _ in range(20):
-        bench.put_velocity(0.2)
+        bench.put_velocity(0.0)
         bench.tick()
     hand = np.zeros(7)
     for tick in range(300):
         hand[0] = max(-0.1 * tick, -14.5)
         bench.plant.push(hand)
-        bench.put_velocity(0.2)
+        bench.put_velocity(0.0)
         bench.tick()
     assert [trip.protection.label for trip in bench.supervisor.trips] == ["P19"]
     before = bench.truth.position[0]
@@ -954,6 +954,7 @@ def test_an_arm_that_is_pushed_stops_and_gives_way():
         hand[0] = min(-14.5 + 0.1 * tick, 0.0)
         bench.plant.push(hand)
         bench.tick()
+    bench.tick(1000)
     assert bench.supervisor.state is State.HOLD
     assert np.abs(bench.truth.velocity).max() < 0.05
     assert bench.ask(Verb.ACK) == ""
