@@ -24,3 +24,17 @@ def test_a_limit_is_looked_at_only_where_braking_from_the_cap_could_reach_it(mon
         looked.clear()
         box.bounds(position, rest)
         assert bool(looked) is looked_at
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize(("past", "share"), [(0.001, 0.02 / 0.9), (0.0049, 0.098 / 0.9), (0.006, 0.1), (0.5, 0.1)])
+def test_a_joint_past_its_edge_is_led_back_in_proportion_up_to_a_tenth_of_its_cap(side, past, share):
+    """At 20 times the excess, for a cap of 0.9 rad/s and for others in the same proportion."""
+    robot = load_robot("panda", [f"joints.{joint}.acceleration=1e6" for joint in range(7)])
+    for joint, cap in enumerate(0.9 * robot.limits.velocity):
+        box = JointBox(robot, 0.002, 0.9, pull=20.0 * cap / 0.9)
+        position = 0.5 * (robot.limits.upper + robot.limits.lower)
+        edge = robot.limits.upper[joint] if side > 0 else -robot.limits.lower[joint]
+        position[joint] = side * (edge - robot.profile.safety.position_margin + past)
+        lower, upper = box.bounds(position, np.zeros(7))
+        assert (upper if side > 0 else -lower)[joint] == pytest.approx(-min(share, 0.1) * cap)
