@@ -67,4 +67,4 @@ class Lookahead:
                     normals.append(row.normal * (self._reaction + rest))
                     bounds.append(row.bound - row.normal @ velocity)
                     flags.append(flag)
-        return Rows(np.array(normals).reshape(-1, len(position)), np.array(bounds), flags)
+        return Rows(np.array(normals).reshape(len(normals), len(position)), np.array(bounds), flags)

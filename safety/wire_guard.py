@@ -62,6 +62,7 @@ class WireGripper:
     """The gripper's motor, in POS_FORCE mode."""
 
     def __init__(self, gripper: GripperProfile, drive: Drive) -> None:
+        self.id = drive.id + Offset.POS_FORCE
         per_metre = abs(gripper.motor_open) / gripper.width
         self._least, self._most = sorted((0.0, gripper.motor_open))
         self._speed = gripper.speed * per_metre
@@ -84,12 +85,10 @@ class WireGuard:
         self.joints = [WireJoint(drive) for drive in drives]
         self._index = {drive.id: index for index, drive in enumerate(drives)}
         self._motors = set(self._index)
-        self._grip_id: int | None = None
         self._gripper: WireGripper | None = None
         if profile.gripper and profile.gripper.drive:
             drive = profile.gripper.drive
             self._motors.add(drive.id)
-            self._grip_id = drive.id + Offset.POS_FORCE
             self._gripper = WireGripper(profile.gripper, drive)
 
     def kind(self, arbitration_id: int, data: bytes) -> Kind | int | None:
@@ -100,7 +99,7 @@ class WireGuard:
             if data[:7] == _PREFIX:
                 return _SPECIALS.get(data[7])
             return self._index.get(arbitration_id)
-        if arbitration_id == self._grip_id and self._gripper is not None:
+        if self._gripper is not None and arbitration_id == self._gripper.id:
             return Kind.GRIP if self._gripper.fits(data) else None
         if arbitration_id == BROADCAST_ID and int.from_bytes(data[:2], "little") in self._motors:
             return _register_kind(data[2], data[3])

@@ -30,6 +30,10 @@ def test_a_torque_above_its_threshold_for_20_ms_is_contact(robot: Robot, side, s
             assert f"{profile.name} feels {side * share * profile.torque:.1f} Nm" in trip.cause
 
 
+def test_before_the_first_sample_nothing_touches(panda: Robot):
+    assert ContactReflex(panda).touched is False
+
+
 def test_a_knock_that_ends_in_time_is_none(panda: Robot):
     reflex = ContactReflex(panda)
     for stamp, share in [(0, 1.0), (18, 1.0), (19, 0.0), (20, 1.0), (39, 1.0)]:

@@ -355,9 +355,11 @@ def test_the_time_of_a_motion_is_counted_to_the_nanosecond(first, share, refused
 @pytest.mark.parametrize(("more", "refused"), [(-1e-12, False), (0.5e-9, True)])
 def test_the_very_first_motion_has_a_period_too(more, refused):
     """Told by how far off it may begin."""
-    bench = Bench()
+    guard = Guard(PANDA, lambda: State.RUN)
+    guard.observe(Sample(0, HOME, REST, REST, np.zeros(7, np.int64)), 0)
     start = SAFETY.bump + 1.001 * PANDA.limits.velocity[0] * PERIOD * 1e-9 + more
-    assert bench.command(position=HOME + start * np.eye(7)[0]) is (Protection.BUMP if refused else None)
+    text = guard.command(Command(CommandMode.TRACK, HOME + start * np.eye(7)[0], REST, REST))
+    assert ("start at" in text) is refused
 
 
 def test_a_turn_is_told_by_where_a_joint_is_not_by_how_fast_it_moves():

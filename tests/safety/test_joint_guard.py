@@ -305,3 +305,12 @@ def test_a_stop_a_micrometre_past_a_soft_limit_is_rounding(index, side, beyond, 
     joint.keep(inside)
     outside = inside._replace(position=edge + side * beyond)
     assert ask(joint, outside) is (Protection.SOFT_LIMIT if refused else None)
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.9, False), (1.1, True)])
+def test_what_rounding_may_have_cost_is_added_to_a_limit(share, refused):
+    finding = ask(guard(track()), track(kd=1.001 * KD + share * STEP.kd), STEP)
+    assert finding is (Protection.FRAMES if refused else None)
+    most = 1.001 * JOINT.torque + share * STEP.effort
+    finding = ask(guard(track(effort=JOINT.torque)), track(effort=most), STEP)
+    assert finding is (Protection.TORQUE if refused else None)

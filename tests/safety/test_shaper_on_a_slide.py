@@ -356,3 +356,14 @@ def test_a_tool_outside_gets_no_further_out(depth, further, brakes):
     shaped = Shaper(robot, slide).step(position, velocity, velocity, slide.at(position), np.zeros((3, 7)))
     assert (Clip.PREDICTED_STOP in shaped.clip) is brakes
     assert shaped.velocity == pytest.approx(REST if brakes else velocity, abs=1e-12)
+
+
+def test_of_two_bounds_that_are_near_one_that_is_passed_is_enough():
+    """The tool comes from the sphere's surface, inwards, towards a wall."""
+    speed = 0.1
+    offset = -(room(a_robot(), 0.0) - 1e-3)
+    stand = offset + way_to_rest(a_robot(SLUGGISH), speed) + a_robot().profile.safety.sphere_margin - 1e-6
+    x, y, z = (float(value) for value in MIDDLE + stand * AXIS)
+    robot = a_robot(SLUGGISH, f"keep_out=[{{kind: plane, name: a, point: [{x}, {y}, {z}], normal: [-0.6, 0, -0.8]}}]")
+    shaped = step(robot, at(offset), along(speed), along(speed))
+    assert shaped.clip is Clip.PREDICTED_STOP

@@ -97,3 +97,11 @@ def test_the_predicted_stop_of_the_tool_counts(panda: Robot):
         assert (trip is not None) is trips
         if trip is not None:
             assert "tool would stop past the bound of 'sphere'" in trip.cause
+
+
+def test_each_joint_is_judged_by_its_own_cap(panda: Robot):
+    velocity = np.zeros(7)
+    velocity[0] = panda.limits.velocity[0] + panda.profile.safety.velocity_tolerance + 0.01
+    velocity[6] = panda.limits.velocity[6]  # faster, but it may be
+    trip = StoppableMotion(panda, AtCentre(panda)).check(np.array(panda.profile.home), velocity, 0)
+    assert "panda_joint1 moves at 1.06 rad/s" in trip.cause

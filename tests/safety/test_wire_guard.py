@@ -83,6 +83,8 @@ def test_a_joint_that_woke_up_a_turn_off_is_read_where_it_is(turns, gear):
         assert wire.asked(data, measured + turns * turn).position == pytest.approx(0.3 + turns * turn, abs=3e-4)
     for measured, read in ((0.4 * turn, 0.3), (-0.6 * turn, 0.3 - turn), (0.3 + 0.6 * turn, 0.3 + turn)):
         assert wire.asked(data, measured).position == pytest.approx(read, abs=3e-4)
+    far = encode_mit(MitCommand(5.0 * gear, 0.0, 1.0, 1.0, 0.0), MOTORS["DM4340"])
+    assert wire.asked(far, 5.0 - 0.6 * turn).position == pytest.approx(5.0 - turn, abs=3e-4)
     # No more than one turn: what is further off is a bump.
     assert wire.asked(data, 0.3 + 2.0 * turn).position == pytest.approx(0.3 + turn, abs=3e-4)
     assert wire.asked(data, math.nan).position == pytest.approx(0.3, abs=3e-4)
