@@ -12,6 +12,7 @@ from typing import NamedTuple, Self
 import can
 
 from robotctl.hal.can.damiao.codec import Special
+from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S
 from robotctl.hal.errors import HardwareError
 
 _START_S = 30.0
@@ -33,11 +34,20 @@ class Heard(NamedTuple):
 class Emulator:
     """The motors of a robot. End it before the frames are asked for: then its log is complete."""
 
-    def __init__(self, folder: Path, robot: str, joints: int) -> None:
+    def __init__(self, folder: Path, robot: str, joints: int, watchdog_s: float) -> None:
+        """Start them.
+
+        Args:
+            folder: for their logs.
+            robot: name, or path of a profile.
+            joints: how many motors, ids 1 to this, are those of the arm.
+            watchdog_s: of every drive.
+        """
         self._joints = joints
         self._told = folder / "emulate.log"
         self._frames = folder / "bus.log"
         command = [sys.executable, "-m", "robotctl.cli.main", "emulate", "--robot", robot, "--log", str(self._frames)]
+        command += ["--register", f"all:TIMEOUT={round(watchdog_s / TIMEOUT_UNIT_S)}"]
         with self._told.open("w") as output:
             self._process = subprocess.Popen(command, stdout=output, stdin=subprocess.DEVNULL)
 

@@ -45,10 +45,10 @@ def torques(act: Act, scale: float = _TORQUE_SHARE) -> Policy:
     return policy
 
 
-def sway(bench: Bench) -> Policy:
-    """Swing every joint at up to its cap, once in two seconds, each with a phase of its own."""
+def sway(bench: Bench, share: float = 1.0) -> Policy:
+    """Swing every joint at up to a share of its cap, once in two seconds, each with a phase of its own."""
     phase = bench.random.uniform(0.0, 2.0 * np.pi, bench.robot.dof)
-    return velocities(lambda time, _: np.sin(np.pi * time + phase), 1.0)
+    return velocities(lambda time, _: np.sin(np.pi * time + phase), share)
 
 
 def random(robot: Robot, rng: np.random.Generator) -> Act:

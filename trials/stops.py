@@ -71,9 +71,9 @@ class Expected:
         return [(protection.label, int(category)) for protection, category in pairs]
 
 
-def running(bench: Bench) -> None:
-    """Let a policy swing the arm about, until a moment that the seed chooses."""
-    bench.start(sway(bench))
+def running(bench: Bench, share: float = 1.0) -> None:
+    """Let a policy swing the arm about at a share of its caps, until a moment that the seed chooses."""
+    bench.start(sway(bench, share))
     bench.run(_LEAD_S + bench.random.uniform(0.0, _MOMENTS_S))
 
 

@@ -205,7 +205,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
                 category=Category.BRAKE_OFF,
                 within_s=1.0,
                 rest_s=1.5,
-                excused=frozenset({"velocity"}),
+                excused=frozenset({"velocity", "position", "sphere"}),
             ),
             _resetting,
         ),
