@@ -14,7 +14,7 @@ from typing import Any
 from robotctl.control import registry
 from robotctl.control.loop import Loop
 from robotctl.control.operator import Verb
-from robotctl.control.process_tools import go_real_time, name_process, signal_on_parent_death
+from robotctl.control.process_tools import go_real_time, leave_real_time, name_process, signal_on_parent_death
 from robotctl.control.shared import Link, Power
 from robotctl.control.task_reset import parse
 from robotctl.hal.backend import open_backend
@@ -72,6 +72,7 @@ def main(text: str) -> int:
     try:
         return _run(loop, link, clock, config)
     finally:
+        leave_real_time()
         entry.unlink(missing_ok=True)
 
 

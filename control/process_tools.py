@@ -34,15 +34,21 @@ def go_real_time(priority: int = CONTROL_PRIORITY) -> list[str]:
     SCHED_FIFO, all memory locked, garbage collector frozen and off: the loop allocates no cycles.
     """
     missing = []
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except PermissionError:
-        missing.append("SCHED_FIFO")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
     # Locking under a finite limit would make later allocations fail rather than page.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     if not (unlimited or os.geteuid() == 0) or _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
         missing.append("locked memory")
-    gc.collect()
-    gc.freeze()
-    gc.disable()
+    # Last, since locking takes tens of milliseconds, in which no other loop should be held up.
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except PermissionError:
+        missing.insert(0, "SCHED_FIFO")
     return missing
+
+
+def leave_real_time() -> None:
+    """Give the priority back before the end: taking a process apart takes the kernel tens of milliseconds, too."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

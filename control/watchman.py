@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from robotctl.control import registry
 from robotctl.control.legacy import Legacy, sound
 from robotctl.control.other_process import OtherProcess
-from robotctl.control.process_tools import WATCHMAN_PRIORITY, go_real_time, name_process
+from robotctl.control.process_tools import WATCHMAN_PRIORITY, go_real_time, leave_real_time, name_process
 from robotctl.control.pulse import Pulse
 from robotctl.control.rescue import Rescue
 from robotctl.control.shared import Link, Power
@@ -128,6 +128,7 @@ def main(text: str) -> int:
         go_real_time(WATCHMAN_PRIORITY)
         Watchman(robot, link, clock, rescue).watch(control)
     finally:
+        leave_real_time()
         registry.unregister(config.control)  # one that was killed could not do it itself
         entry.unlink(missing_ok=True)
     return 0
