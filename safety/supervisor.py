@@ -69,10 +69,11 @@ class Supervisor:
         self._grace_ns = round(safety.heartbeat_grace_s * 1e9)
         self._stopping_limit_ns = round((robot.stopping_time_s + _STOP_ALLOWANCE_S) * 1e9)
         self._stopping_since_ns: int | None = None
-        self._settled = 0
-        self._was_running = False
-        self._power_cycled = False
-        self._fast_since_ns = 0
+        # Set by every change of state, every stop, every trip, and in every tick: they need no first value.
+        self._settled: int
+        self._was_running: bool
+        self._power_cycled: bool
+        self._fast_since_ns: int
         self.runs_away = False
         """Whether a joint goes on too fast although it should have been stopped: damping does not help."""
 
@@ -121,7 +122,7 @@ class Supervisor:
         harder = (
             self.category is None
             or trip.category < self.category
-            or (trip.category == self.category and self.cause is None)
+            or self.cause is None  # the operator's: of a softer trip none gets past the states
         )
         if self.state in ENABLED and harder and not (event is Event.TRIP_HOLD and self.state not in _SOFT_TRIPPABLE):
             self._was_running = self.state is State.RUN
@@ -263,10 +264,9 @@ class Supervisor:
         cause = self.cause
         assert cause is not None  # a trip out of RUN
         match cause.protection:
-            case Protection.HEARTBEAT if now_ns - cause.onset_ns > self._grace_ns:
-                self._was_running = False
-            case Protection.HEARTBEAT if self.admission.fresh(now_ns) is not None:
-                self.handle(Event.CLEARED)
+            case Protection.HEARTBEAT:
+                if self.admission.fresh(now_ns) is not None and now_ns - cause.onset_ns <= self._grace_ns:
+                    self.handle(Event.CLEARED)
             case Protection.DEADMAN if self.deadman.permits and self.state is State.HOLD:
                 self.admission.renew(now_ns)
                 self.handle(Event.CLEARED)

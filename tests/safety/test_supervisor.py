@@ -180,6 +180,7 @@ def test_every_stop_and_every_entry_into_armed_raises_the_epoch(state, event):
 
 def test_the_first_epoch_is_0():
     assert Supervisor(ROBOT).epoch == 0
+    assert not Supervisor(ROBOT).runs_away
 
 
 def test_starting_keeps_the_epoch_so_that_a_policy_may_be_ready_first():
