@@ -66,7 +66,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         live_stop_scenario(10, "suspended", "SIGSTOP of the policy", _send("policy", stop), silent),
         live_tolerated_scenario(
             10,
-            "back in time",
+            "process back in time",
             "the policy is suspended for 0.3 s",
             _send("policy", stop, go, wait_s=_BREATH_S),
             trips=("P10",),
