@@ -76,7 +76,7 @@ class Survey:
     durations: dict[str, float]
     """Of each test, s."""
     tests: dict[str, dict[int, list[str]]]
-    """By file and line: the tests that execute it."""
+    """By file and line: the tests that execute it, "" for what runs outside of tests."""
     integers: dict[str, set[Place]]
     """By file: sides of comparisons that never held anything but integers."""
 
@@ -166,7 +166,9 @@ def _tests(case: Case, seen: Survey) -> dict[str, float]:
     if case.mutant.reach is None:
         return seen.durations
     lines = seen.tests[case.file]
-    return {test: seen.durations[test] for line in case.mutant.reach for test in lines.get(line, [])}
+    reaching = {test for line in case.mutant.reach for test in lines.get(line, [])}
+    # What runs outside any test was made for all tests of a module, or for many by a fixture.
+    return seen.durations if "" in reaching else {test: seen.durations[test] for test in reaching}
 
 
 def _fate(status: int) -> str:
@@ -237,16 +239,10 @@ def _run_survey(package: Package, answer: Path) -> int:
     code = _pytest(package, [str(package.tests)], watcher)
     measured.stop()
     data = measured.get_data()
-    tests = {file: _contexts(data, package.folder / file) for file in package.trees}
+    tests = {file: data.contexts_by_lineno(str((package.folder / file).resolve())) for file in package.trees}
     integers = {file: {where for where, integer in sides.items() if integer} for file, sides in always.items()}
     answer.write_bytes(pickle.dumps(Survey(watcher.durations, tests, integers)))
     return code
-
-
-def _contexts(data: coverage.CoverageData, path: Path) -> dict[int, list[str]]:
-    """Return the tests that executed each line."""
-    lines = data.contexts_by_lineno(str(path.resolve()))
-    return {line: [test for test in tests if test] for line, tests in lines.items()}
 
 
 def _pytest(package: Package, where: list[str], plugin: object) -> int:

@@ -27,17 +27,26 @@ def countdown(count):
     return count
 
 
+def twice(count):
+    return count + count
+
+
 def unused(count):
     return -count
 '''
 TESTS = """
-from toy.gate import LIMIT, countdown, passes
+from toy.gate import LIMIT, countdown, passes, twice
+
+FOUR = twice(2)  # outside of the test that uses it
 
 def test_passes():
     assert LIMIT  # a changed constant is changed here, too
     assert passes(2, 0.4)
     assert not passes(3, 0.4)
     assert not passes(2, 0.8)
+
+def test_twice():
+    assert FOUR == 4
 
 def test_countdown():
     assert countdown(3) == 0
@@ -71,7 +80,7 @@ def campaign(folder, tests):
 
 def test_a_campaign(tmp_path):
     done = campaign(tmp_path, TESTS)
-    assert len({case for case, _, _ in done}) == len(done) == 19
+    assert len({case for case, _, _ in done}) == len(done) == 21
     fates = {change: fate for _, change, fate in done}
     lived = {change: fate for change, fate in fates.items() if fate != "killed"}
     assert lived == {
