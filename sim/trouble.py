@@ -132,6 +132,20 @@ class Misread(Trouble):
         return sample._replace(position=sample.position + self._position, velocity=sample.velocity + self._velocity)
 
 
+class Frozen(Trouble):
+    """Some joints are measured at rest where they were in the last sample, however they move: a stuck encoder."""
+
+    def __init__(self, axes: Iterable[int], last: Sample) -> None:
+        self._axes = list(axes)
+        self._last = last
+
+    def on_read(self, sample: Sample) -> Sample:
+        self.acted += 1
+        position, velocity = sample.position.copy(), sample.velocity.copy()
+        position[self._axes], velocity[self._axes] = self._last.position[self._axes], 0.0
+        return sample._replace(position=position, velocity=velocity)
+
+
 class Heat(Trouble):
     """Some drives report a temperature, degrees Celsius."""
 

@@ -13,6 +13,7 @@ from robotctl.trials.policies import sway
 from robotctl.trials.scenario import Trial
 
 _LOWERING_S = 3.0
+_SETTLE_S = 1.0
 
 
 class Clears(Enum):
@@ -29,6 +30,7 @@ def go_on(bench: Bench, planted: Planted, clears: Clears, trial: Trial) -> None:
     bench.policy = None
     _try_shorter_ways(bench, clears, trial)
     planted.undo()
+    bench.run(_SETTLE_S)
     if clears is Clears.POWER:
         trial.require(bool(bench.ask(Verb.ACK)), "ACK was enough without a power cycle")
         cycle_power(bench)

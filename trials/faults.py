@@ -71,6 +71,31 @@ def stuck(bench: Bench) -> Planted:
     )
 
 
+def walled(bench: Bench, axis: int, stiffness: float, seconds: float) -> Planted:
+    """A moving joint meets something that gives way with a stiffness, Nm/rad, and is taken away after a while."""
+    plant, begun = bench.plant, bench.now_ns
+    state = plant.axis(axis)
+    direction, where = np.sign(state.velocity), state.position
+    ends = begun + round(seconds * 1e9)
+
+    class Wall(twin.Trouble):
+        def on_plant(self) -> None:
+            depth = max(direction * (plant.axis(axis).position - where), 0.0) if bench.now_ns < ends else 0.0
+            self.acted += depth > 0.0
+            torque = np.zeros(bench.robot.dof)
+            torque[axis] = -direction * stiffness * depth
+            plant.push(torque)
+
+    wall = Wall()
+    planted = between(bench, wall)
+
+    def undo() -> None:
+        plant.push(np.zeros(bench.robot.dof))
+        planted.undo()
+
+    return Planted(undo, planted.showed)
+
+
 def pushed(bench: Bench, torque: Vector, seconds: float) -> Planted:
     """Somebody pushes the joints with some torques (n,), Nm, for a while."""
     plant, begun = bench.plant, bench.now_ns
@@ -224,6 +249,19 @@ def misread(bench: Bench, axis: int, offset: float) -> Planted:
 
     trouble = wire.Misreport(offset=offset * wiring.sign * wiring.gear, ranges=drive.ranges)
     return on_wire(bench, trouble, [axis], showed)
+
+
+def frozen(bench: Bench, axis: int) -> Planted:
+    """A joint is measured at rest where it is now, however it moves."""
+    if bench.twin:
+        return between(bench, twin.Frozen([axis], _seen(bench)))
+    drive, begun = _drive(bench, axis), bench.now_ns
+
+    def showed() -> bool:
+        records = bench.since(begun)
+        return bool(np.abs(records["velocity"] - records["true_velocity"])[:, axis].max() > 0.1)
+
+    return on_wire(bench, wire.Frozen(angle=drive.angle, ranges=drive.ranges), [axis], showed)
 
 
 def cycle_power(bench: Bench) -> None:

@@ -97,6 +97,11 @@ class DamiaoDrive:
         return self.status == Status.ENABLED
 
     @property
+    def angle(self) -> float:
+        """Its angle as it would report it without noise, rad."""
+        return self.shaft.state()[0] - self._zero + self._turns
+
+    @property
     def ranges(self) -> Ranges:
         """Its present full scale, registers 21 to 23."""
         return Ranges(self.memory[Register.PMAX], self.memory[Register.VMAX], self.memory[Register.TMAX])
@@ -325,7 +330,7 @@ class DamiaoDrive:
     def _read(self, register: int) -> float:
         match register:
             case Register.P_M | Register.XOUT:
-                return self.shaft.state()[0] - self._zero + self._turns
+                return self.angle
             case 61:
                 return self.thermal.mosfet
             case 62:

@@ -180,6 +180,25 @@ class Misreport(Trouble):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Frozen(Trouble):
+    """The feedback tells of a motor at rest at one angle, however it moves: an encoder that is stuck."""
+
+    angle: float = 0.0
+    """rad of the motor"""
+    ranges: Ranges
+    """The drive's."""
+
+    def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
+        return [self._freeze(reply) for reply in replies]
+
+    def _freeze(self, reply: Reply) -> Reply:
+        if self.motor_id is None or not is_feedback(reply.data, self.motor_id):
+            return reply
+        feedback = decode_feedback(reply.data, self.ranges)
+        return reply._replace(data=encode_feedback(feedback._replace(position=self.angle, velocity=0.0), self.ranges))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Short(Trouble):
     """Replies lose their last bytes."""
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robotctl.hal.robot import Robot
+from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.trip import Category, Protection
 from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
@@ -15,6 +15,7 @@ from robotctl.trials.faults import (
     everywhere,
     failed,
     fastest,
+    frozen,
     hot,
     misread,
     mute,
@@ -28,13 +29,13 @@ from robotctl.trials.faults import (
 from robotctl.trials.policies import velocities
 from robotctl.trials.poses import at_limit, at_sphere
 from robotctl.trials.resuming import resuming_scenario
-from robotctl.trials.scenario import Scenario
+from robotctl.trials.scenario import Scenario, Trial
 from robotctl.trials.stops import Expected, still, stop_scenario
 
 _BEYOND = 0.005
 """rad or m past where a breach begins."""
 _PULL_S = 0.2
-_TURN = 0.7
+_SLOW = 0.25
 """Share of a velocity cap."""
 _SPRING_S = 3.0
 """Moved by hand, the arm springs back to where its drives hold it, and swings."""
@@ -85,12 +86,25 @@ def _kicked(times: float) -> Callable[[Bench], Planted]:
     return plant
 
 
-def _turning_wrist(bench: Bench) -> None:
-    """Turn the last joint alone: where it seizes up, nothing else is whipped about."""
-    turn = np.zeros(bench.robot.dof)
-    turn[-1] = bench.random.choice([-_TURN, _TURN])
-    bench.start(velocities(lambda _time, _position: turn, 1.0))
+def _slowly(bench: Bench) -> None:
+    """Move the first joint alone, so slowly that no torque tells what has become of it before its way does."""
+    move = np.zeros(bench.robot.dof)
+    move[0] = bench.random.choice([-_SLOW, _SLOW])
+    bench.start(velocities(lambda _time, _position: move, 1.0))
     bench.run(bench.random.uniform(0.3, 0.6))
+
+
+def _untouchable(scenario: Scenario) -> Scenario:
+    """Return a scenario without the contact reflex, which would be quicker: what stands behind it is tried."""
+
+    def run(robot: Robot, backend: str, seed: int) -> Trial:
+        return scenario.run(load_robot(str(robot.source), ["safety.contact=1.0"]), backend, seed)
+
+    return replace(scenario, run=run)
+
+
+def _unseen(bench: Bench) -> Planted:
+    return frozen(bench, fastest(bench))
 
 
 def _some(bench: Bench) -> int:
@@ -173,11 +187,21 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         rest_s=_CRASH_REST_S,
         excused=_CRASH,
     )
-    crash = replace(led_away, or_else=((Protection.OVERSPEED, Category.BRAKE_OFF),))
-    wrist = replace(led_away, rest_s=None, within_s=safety.tracking_time_s + 0.02)
+    crash = replace(
+        led_away,
+        or_else=((Protection.CONTACT, Category.BRAKE_HOLD), (Protection.OVERSPEED, Category.BRAKE_OFF)),
+    )
+    not_seen = replace(
+        led_away, within_s=safety.tracking_time_s + 0.1, or_else=((Protection.CONTACT, Category.BRAKE_HOLD),)
+    ).losing_torque(robot)
+    slow = replace(led_away, rest_s=None, excused=frozenset(), within_s=1.5)
     astray = replace(
         led_away,
-        or_else=((Protection.OVERSPEED, Category.BRAKE_OFF), (Protection.OVERSPEED, Category.CUT)),
+        or_else=(
+            (Protection.CONTACT, Category.BRAKE_HOLD),
+            (Protection.OVERSPEED, Category.BRAKE_OFF),
+            (Protection.OVERSPEED, Category.CUT),
+        ),
     ).losing_torque(robot)
     overspeed = replace(
         led_away,
@@ -201,7 +225,10 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         stop_scenario(12, "power lost", "a drive loses its supply", lambda b: unpowered(b, [_some(b)]), dead),
         resuming_scenario(12, "short gap", "no drive is heard of for 30 ms", _all_mute, 0.03),
         stop_scenario(17, "stuck joint", "the fastest joint seizes up", stuck, crash),
-        stop_scenario(17, "stuck wrist", "the last joint seizes up, alone under way", stuck, wrist, _turning_wrist),
+        _untouchable(
+            stop_scenario(17, "stuck slowly", "the same, slowly, with the contact reflex off", stuck, slow, _slowly)
+        ),
+        stop_scenario(17, "stuck encoder", "a joint is measured at rest, but moves on", _unseen, not_seen),
         stop_scenario(17, "wrong direction", "a drive pushes the wrong way", _wrong_way, astray),
         stop_scenario(17, "limp drive", "a drive that is on gives no torque", _limp, astray),
         stop_scenario(17, "runaway", "a drive turns with 30 % of its torque by itself", _runaway, astray),
