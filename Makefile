@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install -qq
 
-.PHONY: run test check coverage mutation format bench clean
+.PHONY: run test check coverage mutation format faults bench clean
 
 run: .venv/run ## reach three targets on the twin
 	$(BIN)/robotctl run --backend sim
@@ -28,6 +28,12 @@ check: .venv/dev ## format, lint, types
 format: .venv/dev ## write the format and the fixes that ruff can make
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+faults: .venv/run ## provoke every protection on every robot and backend, and write docs/safety-report.md
+	status=0; \
+	for arm in "panda sim" "panda can" "openarm sim" "openarm can" "kinova sim" "xarm7 sim"; do \
+		set -- $$arm; $(BIN)/robotctl faults --robot $$1 --backend $$2 --report docs/safety-report.md || status=1; \
+	done; exit $$status
 
 bench: .venv/run ## what a tick costs beside the bare library calls
 	$(BIN)/robotctl bench tick

@@ -52,8 +52,8 @@ class Expected:
     """What else may come first, where it depends on the joint and the motion which threshold is passed first."""
     excused: frozenset[str] = frozenset()
     """Invariants that the fault itself breaks: limits as the judge names them, or `drift`."""
-
     note: str = ""
+    """What else has to be known, for the report."""
 
     def __str__(self) -> str:
         names = " or ".join(f"{name} category {category}" for name, category in self.accepted)

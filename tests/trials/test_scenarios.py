@@ -29,9 +29,6 @@ from robotctl.trials.scenario import Scenario
 from robotctl.trials.scenarios import scenarios
 from robotctl.trials.stops import Expected, stop_scenario
 
-LATER = {8, 19}
-"""Waiting for the shaping of torques and for the contact reflex."""
-
 
 def in_lockstep(robot: Robot, backend: str, number: int | None = None) -> list[Scenario]:
     """Each once, without those that need real time."""
@@ -43,7 +40,6 @@ ALL = [
     pytest.param(robot, backend, scenario, id=f"{robot}-{backend}-{scenario.label}-{scenario.name}")
     for robot, backend in (("panda", "sim"), ("openarm", "can"))
     for scenario in in_lockstep(load_robot(robot), backend)
-    if scenario.number not in LATER
 ]
 
 
