@@ -71,23 +71,24 @@ def stuck(bench: Bench) -> Planted:
     )
 
 
-def walled(bench: Bench, axis: int, stiffness: float, seconds: float) -> Planted:
-    """A moving joint meets something that gives way with a stiffness, Nm/rad, and is taken away after a while."""
+def resisted(bench: Bench, axis: int, stiffness: float, damping: float, seconds: float) -> Planted:
+    """A moving joint meets something, which resists with Nm/rad and Nms/rad and is taken away after a while."""
     plant, begun = bench.plant, bench.now_ns
-    state = plant.axis(axis)
-    direction, where = np.sign(state.velocity), state.position
+    start = plant.axis(axis)
+    ahead = float(np.sign(start.velocity))
     ends = begun + round(seconds * 1e9)
 
-    class Wall(twin.Trouble):
+    class Resistance(twin.Trouble):
         def on_plant(self) -> None:
-            depth = max(direction * (plant.axis(axis).position - where), 0.0) if bench.now_ns < ends else 0.0
-            self.acted += depth > 0.0
+            state = plant.axis(axis)
+            depth = max(ahead * (state.position - start.position), 0.0)
+            force = stiffness * depth + damping * max(ahead * state.velocity, 0.0) if bench.now_ns < ends else 0.0
+            self.acted += force > 0.0
             torque = np.zeros(bench.robot.dof)
-            torque[axis] = -direction * stiffness * depth
+            torque[axis] = -ahead * force
             plant.push(torque)
 
-    wall = Wall()
-    planted = between(bench, wall)
+    planted = between(bench, Resistance())
 
     def undo() -> None:
         plant.push(np.zeros(bench.robot.dof))

@@ -81,8 +81,7 @@ def test_it_tells_as_it_goes(panda: Robot) -> None:
 )
 def test_every_protection_has_a_scenario(robot: str, backend: str) -> None:
     found = scenarios(load_robot(robot), backend)
-    # The contact reflex (P19) is shown by tests/control/test_loop.py; the campaign cannot provoke it yet, and says so.
-    assert {scenario.number for scenario in found} == set(TITLES) - {19}
+    assert {scenario.number for scenario in found} == set(TITLES)
     names = [(scenario.number, scenario.name) for scenario in found]
     assert len(set(names)) == len(names)
     for scenario in found:
