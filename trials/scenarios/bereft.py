@@ -8,11 +8,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from robotctl.control.session import Stopped
 from robotctl.hal.errors import HardwareError
 from robotctl.hal.profile import CLASSIC_HZ
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.trials.emulator import Emulator
-from robotctl.trials.live import Live, under_way
+from robotctl.trials.live import ATTEMPTS, Live, under_way
 from robotctl.trials.scenario import Scenario, Trial
 
 _REPEATS = 2
@@ -41,7 +42,7 @@ def _taken_over(emulator: Emulator, robot: Robot, trial: Trial) -> None:
     trial.require(len(motors) == robot.dof, f"only the motors {sorted(motors)} were taken")
     trial.require({frame.kind for frame in after} <= {"damp", "DISABLE"}, "something else than a stop was sent")
     trial.require(not emulator.lost(), f"their own watchdogs had to act: {emulator.lost()}")
-    trial.figures["reaction_s"] = max(first, default=float("inf"))
+    _in_time(emulator, robot, max(first, default=float("inf")), trial)
     trial.seen = "P27: the watchman switched the drives off"
 
 
@@ -49,8 +50,30 @@ def _off_by_themselves(emulator: Emulator, robot: Robot, trial: Trial) -> None:
     """Require that every drive's own watchdog acted."""
     lost = {name: after for name, after in emulator.lost().items() if name != "gripper"}
     trial.require(len(lost) == robot.dof, f"only {len(lost)} of {robot.dof} watchdogs acted")
-    trial.figures["reaction_s"] = max(lost.values(), default=float("inf"))
+    _in_time(emulator, robot, max(lost.values(), default=float("inf")), trial)
     trial.seen = "drives off by themselves"
+
+
+def _strike(emulator: Emulator, robot: Robot, backend: str, seed: int, kill: Callable[[Live], None]) -> bool:
+    """Bring an arm on the emulator under way, and kill; return whether it came so far."""
+    overrides = (f"servo_hz={CLASSIC_HZ}",)  # the adapter carries classic CAN
+    slow = load_robot(str(robot.source), overrides)
+    struck = False
+    served = under_way(slow, backend, seed, lambda: emulator.channel, overrides)
+    with emulator, suppress(HardwareError, Stopped), served as live:
+        # Leaving it raises what has become of the control process.
+        struck = not live.session.trips
+        if struck:
+            kill(live)
+            time.sleep(_AFTER_S)
+    return struck
+
+
+def _in_time(emulator: Emulator, robot: Robot, reaction_s: float, trial: Trial) -> None:
+    timeout = robot.profile.safety.drive_timeout_s
+    trial.figures["reaction_s"] = reaction_s
+    trial.require(reaction_s <= timeout + _ROUNDING_S, f"off after {1e3 * reaction_s:.0f} ms, not {1e3 * timeout:.0f}")
+    trial.require(len(emulator.off() - {"gripper"}) == robot.dof, "not every drive went off")
 
 
 def _bereft_scenario(
@@ -61,27 +84,15 @@ def _bereft_scenario(
     judge: Callable[[Emulator, Robot, Trial], None],
 ) -> Scenario:
     def run(robot: Robot, backend: str, seed: int) -> Trial:
-        trial = Trial()
-        overrides = (f"servo_hz={CLASSIC_HZ}",)  # the adapter carries classic CAN
-        slow = load_robot(str(robot.source), overrides)
-        timeout = robot.profile.safety.drive_timeout_s
-        with tempfile.TemporaryDirectory() as folder:
-            emulator = Emulator(Path(folder), str(robot.source), robot.dof, timeout)
-            with (
-                emulator,
-                suppress(HardwareError),
-                under_way(slow, backend, seed, lambda: emulator.channel, overrides) as live,
-            ):
-                # Leaving it raises what has become of the control process.
-                trial.require(not live.session.trips, f"stopped before: {live.session.trips}")
-                kill(live)
-                time.sleep(_AFTER_S)
-            judge(emulator, robot, trial)
-            late = trial.figures["reaction_s"]
-            trial.require(
-                late <= timeout + _ROUNDING_S, f"off after {1e3 * late:.0f} ms instead of {1e3 * timeout:.0f}"
-            )
-            trial.require(len(emulator.off() - {"gripper"}) == robot.dof, "not every drive went off")
+        for attempt in range(ATTEMPTS):
+            trial = Trial()
+            with tempfile.TemporaryDirectory() as folder:
+                emulator = Emulator(Path(folder), str(robot.source), robot.dof, robot.profile.safety.drive_timeout_s)
+                if not _strike(emulator, robot, backend, seed + 100 * attempt, kill):
+                    trial.require(False, "the machine was too busy")
+                    continue
+                judge(emulator, robot, trial)
+            break
         return trial
 
     expected = "every drive off, in the time of its watchdog"

@@ -3,6 +3,7 @@
 import errno
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import can
 import numpy as np
@@ -52,9 +53,7 @@ def _bus_off(bench: Bench) -> Planted:
         return between(bench, Report(Fault("bus", _ERROR_BUS_OFF, "BUS_OFF", "check cable and termination")))
     bus = bench.bus
     bus.report(_ERROR_BUS_OFF)
-    return Planted(
-        lambda: bus.report(_ERROR_RESTARTED), lambda: (bench.arm.bus_statistics() or {})["state"] == "bus-off"
-    )
+    return Planted(lambda: bus.report(_ERROR_RESTARTED), lambda: _statistics(bench)["state"] == "bus-off")
 
 
 def _queue_full(bench: Bench) -> Planted:
@@ -96,16 +95,18 @@ def _no_sense(bench: Bench) -> Planted:
     """A drive's answers lose their last bytes."""
     if bench.twin:
         return between(bench, Reject())
-    rejected = _rejected(bench)
-    return on_wire(bench, wire.Short(), [_some(bench)], lambda: _rejected(bench) > rejected)
+    rejected = _count(bench, "rejected")
+    return on_wire(bench, wire.Short(), [_some(bench)], lambda: _count(bench, "rejected") > rejected)
 
 
 def _flipped(bench: Bench) -> Planted:
     """Every second answer of a drive has a bit flipped on its way."""
-    begun = bench.now_ns
+    begun, strange = bench.now_ns, _count(bench, "unexpected")
 
     def showed() -> bool:
-        return len(bench.since(begun)) > 0
+        records = bench.since(begun)
+        far = np.abs(records["position"] - records["true_position"]).max() > 0.01
+        return bool(far) or _count(bench, "unexpected") > strange
 
     return on_wire(bench, wire.Corrupt(probability=0.5), [_some(bench)], showed)
 
@@ -120,25 +121,35 @@ def _no_number(bench: Bench) -> Planted:
     return between(bench, Misread(wrong))
 
 
-def _on_all(trouble: wire.Trouble) -> Callable[[Bench], Planted]:
+def _on_all(trouble: wire.Trouble, showed: Callable[[Bench, int, int], bool]) -> Callable[[Bench], Planted]:
+    """Return trouble of all motors; `showed` is told how many frames were sent and received meanwhile."""
+
     def plant(bench: Bench) -> Planted:
-        received = int(str((bench.arm.bus_statistics() or {})["received"]))
+        sent, received = _count(bench, "sent"), _count(bench, "received")
         return on_wire(
             bench,
             trouble,
             range(bench.robot.dof),
-            lambda: int(str((bench.arm.bus_statistics() or {})["received"])) > received,
+            lambda: showed(bench, _count(bench, "sent") - sent, _count(bench, "received") - received),
         )
 
     return plant
+
+
+def _late_answers(bench: Bench, _sent: int, _received: int) -> bool:
+    return float(_statistics(bench)["round_trip_us"]["p99"]) > 1e3
 
 
 def _some(bench: Bench) -> int:
     return int(bench.random.integers(bench.robot.dof))
 
 
-def _rejected(bench: Bench) -> int:
-    return int(str((bench.arm.bus_statistics() or {})["rejected"]))
+def _statistics(bench: Bench) -> dict[str, Any]:
+    return bench.arm.bus_statistics() or {}
+
+
+def _count(bench: Bench, counter: str) -> int:
+    return int(_statistics(bench)[counter])
 
 
 def scenarios(robot: Robot, backend: str) -> list[Scenario]:
@@ -183,12 +194,22 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         orphan_scenario(14, "nobody listens", "nothing leaves the host any more", _blocked, without_bus),
         orphan_scenario(14, "unplugged", "the adapter is unplugged", _unplugged, without_bus),
         stop_scenario(15, "flipped bits", "half the answers of a drive have a bit flipped", _flipped, sooner_or_later),
-        tolerated_scenario(15, "twice", "every answer comes twice", _on_all(wire.Duplicate())),
+        tolerated_scenario(
+            15,
+            "twice",
+            "every answer comes twice",
+            _on_all(wire.Duplicate(), lambda _, sent, received: received > 1.5 * sent),
+        ),
         tolerated_scenario(
             15,
             "late and out of order",
             "answers come 1 to 4 ms late",
-            _on_all(wire.Delay(delay_s=0.001, jitter_s=0.003)),
+            _on_all(wire.Delay(delay_s=0.001, jitter_s=0.003), _late_answers),
         ),
-        tolerated_scenario(15, "lost", "2 % of all frames are lost", _on_all(wire.Drop(probability=0.02))),
+        tolerated_scenario(
+            15,
+            "lost",
+            "2 % of all frames are lost",
+            _on_all(wire.Drop(probability=0.02), lambda _, sent, received: received < 0.99 * sent),
+        ),
     ]

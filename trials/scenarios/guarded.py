@@ -78,7 +78,13 @@ def _shaper_that_does_not_stop(bench: Bench) -> Planted:
         box._edge = edge
         box._free = box._free - 1.0
 
-    return Planted(undo, lambda: bench.loop._motion.command is not None)
+    begun, limits, margin = bench.now_ns, bench.robot.limits, bench.robot.profile.safety.position_margin
+
+    def showed() -> bool:
+        led = bench.since(begun)["command_position"]
+        return bool(np.maximum(led - limits.upper, limits.lower - led).max() > -0.75 * margin)
+
+    return Planted(undo, showed)
 
 
 def _burst(bench: Bench) -> Planted:

@@ -14,14 +14,23 @@ _LATE = 1.2
 
 
 def _late_again(bench: Bench) -> Planted:
+    begun = bench.now_ns
     for _ in range(bench.robot.profile.safety.overrun_ticks):
         bench.tick(_LATE)
-    return Planted(lambda: None, lambda: True)
+    return _late_since(bench, begun)
 
 
 def _gap(bench: Bench) -> Planted:
+    begun = bench.now_ns
     bench.tick(1.0 + 1.1 * bench.robot.profile.safety.overrun_s / (bench.robot.period_ns * 1e-9))
-    return Planted(lambda: None, lambda: True)
+    return _late_since(bench, begun)
+
+
+def _late_since(bench: Bench, begun_ns: int) -> Planted:
+    def showed() -> bool:
+        return bool(bench.since(begun_ns)["lateness_ns"].max() > bench.robot.period_ns)
+
+    return Planted(lambda: None, showed)
 
 
 def scenarios(robot: Robot, _backend: str) -> list[Scenario]:

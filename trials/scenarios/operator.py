@@ -28,7 +28,7 @@ _SOURCES: dict[str, Callable[[Bench], None]] = {
 def _from(source: str) -> Callable[[Bench], Planted]:
     def plant(bench: Bench) -> Planted:
         _SOURCES[source](bench)
-        return Planted(lambda: None, lambda: True)
+        return Planted(lambda: None, lambda: "emergency stop" in bench.trips[0]["text"])
 
     return plant
 
@@ -99,7 +99,7 @@ def _switch_stuck(bench: Bench) -> Planted:
         bench.tick()
         bench.link.desk.hold(Grip.HELD)
 
-    return Planted(undo, lambda: True)
+    return Planted(undo, lambda: bench.link.desk.grip == Grip.HELD)
 
 
 def _started_without_switch(robot: Robot, backend: str, seed: int) -> None:
@@ -205,7 +205,8 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
                 category=Category.BRAKE_OFF,
                 within_s=1.0,
                 rest_s=1.5,
-                excused=frozenset({"velocity", "position", "sphere"}),
+                or_else=((Protection.CONTACT, Category.BRAKE_HOLD),),
+                excused=frozenset({"velocity", "position", "sphere", "drift"}),
             ),
             _resetting,
         ),

@@ -16,6 +16,7 @@ from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
 from robotctl.trials.faults import Planted, pulled
 from robotctl.trials.policies import Act
+from robotctl.trials.poses import outside
 from robotctl.trials.scenario import Scenario, Trial
 from robotctl.trials.shaping import clipped, shaped_scenario
 from robotctl.trials.stops import Expected, still, stop_scenario
@@ -29,6 +30,10 @@ _FARTHEST = 0.4
 _TOLERANCE = 2e-3
 """By how much the true clearance may fall short of `proximity_stop`, m."""
 _STEP = 5e-4
+_FARTHEST_POSE = 0.8
+"""rad from home"""
+_ROOM = 0.02
+"""rad and m"""
 _BESIDE = 1e-3
 _PULL_S = 0.4
 
@@ -53,9 +58,19 @@ class Obstacle:
                 self.robot = replace(robot, profile=profile)
                 self._scene = CollisionModel(self.robot, self.kinematics)
                 self._pairs = [index for index, pair in enumerate(self._scene.pairs) if _NAME in pair]
-                if self.clearance(home) > _GAP:
+                if self.clearance(home) > _GAP and self._is_reached():
                     return
         raise ValueError(f"{robot.profile.name}: no room for an obstacle beside the tool")
+
+    def _is_reached(self) -> bool:
+        """Return whether the box is reached with tool and joints well inside their limits."""
+        home, limits = np.array(self.robot.profile.home), self.robot.limits
+        pose, moved = home, 0.0
+        while self.clearance(pose) > 0.0 and moved < _FARTHEST_POSE:
+            pose = pose + _STEP * self.towards(pose)
+            moved = float(np.abs(pose - home).max())
+        room = min(float((limits.upper - pose).min()), float((pose - limits.lower).min()))
+        return self.clearance(pose) <= 0.0 and room > _ROOM and outside(self.robot, self.kinematics, pose) < -_ROOM
 
     def clearance(self, pose: Vector) -> float:
         """Return the least distance of the arm from the box at a pose (n,), m."""
