@@ -106,6 +106,16 @@ def stop_scenario(
     return Scenario(number, name, provoked, str(expected), run)
 
 
+def untouchable(scenario: Scenario) -> Scenario:
+    """Return a scenario without the contact reflex, which would be quicker: what stands behind it is tried."""
+
+    def run(robot: Robot, backend: str, seed: int) -> Trial:
+        numb = robot.profile.safety.model_copy(update={"contact": 1.0})
+        return scenario.run(replace(robot, profile=robot.profile.model_copy(update={"safety": numb})), backend, seed)
+
+    return replace(scenario, provoked=f"{scenario.provoked}; the contact reflex is off", run=run)
+
+
 def _stop(bench: Bench, fault: Fault, expected: Expected, trial: Trial) -> None:
     onset = bench.now_ns
     planted = fault(bench)

@@ -157,7 +157,7 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     safety = robot.profile.safety
     on_bus = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF, within_s=_UNDELIVERED_TICKS * period)
     # For as long as nothing leaves, the drives go on as they were told last.
-    coasting = replace(on_bus, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position"}))
+    coasting = replace(on_bus, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position", "velocity"}))
     # Drives that hear nothing any more go off by their own watchdogs, with a fault.
     unheard = replace(on_bus, clears=Clears.POWER).losing_torque(robot)
     senseless = Expected(

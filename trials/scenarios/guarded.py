@@ -78,13 +78,8 @@ def _shaper_that_does_not_stop(bench: Bench) -> Planted:
         box._edge = edge
         box._free = box._free - 1.0
 
-    begun, limits, margin = bench.now_ns, bench.robot.limits, bench.robot.profile.safety.position_margin
-
-    def showed() -> bool:
-        led = bench.since(begun)["command_position"]
-        return bool(np.maximum(led - limits.upper, limits.lower - led).max() > -0.75 * margin)
-
-    return Planted(undo, showed)
+    # A sound shaper brakes before the guard has anything to say.
+    return Planted(undo, lambda: bench.trips[0]["protection"] == Protection.SOFT_LIMIT.label)
 
 
 def _burst(bench: Bench) -> Planted:

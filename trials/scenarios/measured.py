@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from robotctl.hal.robot import Robot, load_robot
+from robotctl.hal.robot import Robot
 from robotctl.safety.trip import Category, Protection
 from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
@@ -29,11 +29,12 @@ from robotctl.trials.faults import (
 from robotctl.trials.policies import velocities
 from robotctl.trials.poses import at_limit, at_sphere
 from robotctl.trials.resuming import resuming_scenario
-from robotctl.trials.scenario import Scenario, Trial
-from robotctl.trials.stops import Expected, still, stop_scenario
+from robotctl.trials.scenario import Scenario
+from robotctl.trials.stops import Expected, still, stop_scenario, untouchable
 
 _BEYOND = 0.005
 """rad or m past where a breach begins."""
+_DRIVEN_S = 0.02
 _PULL_S = 0.2
 _SLOW = 0.25
 """Share of a velocity cap."""
@@ -92,15 +93,6 @@ def _slowly(bench: Bench) -> None:
     move[0] = bench.random.choice([-_SLOW, _SLOW])
     bench.start(velocities(lambda _time, _position: move, 1.0))
     bench.run(bench.random.uniform(0.3, 0.6))
-
-
-def _untouchable(scenario: Scenario) -> Scenario:
-    """Return a scenario without the contact reflex, which would be quicker: what stands behind it is tried."""
-
-    def run(robot: Robot, backend: str, seed: int) -> Trial:
-        return scenario.run(load_robot(str(robot.source), ["safety.contact=1.0"]), backend, seed)
-
-    return replace(scenario, run=run)
 
 
 def _unseen(bench: Bench) -> Planted:
@@ -206,7 +198,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
     overspeed = replace(
         led_away,
         protection=Protection.OVERSPEED,
-        within_s=3.0 * robot.period_ns * 1e-9,
+        within_s=_DRIVEN_S,
     )
     failure = Expected(
         protection=Protection.DRIVE,
@@ -218,16 +210,18 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
     return [
         stop_scenario(3, "past a limit", "a joint is moved past its soft limit", _past_limit, position, _at_limit),
         stop_scenario(3, "slipped encoder", "a joint is measured past its limit", _slipped, slipped, _at_limit),
-        stop_scenario(5, "outside", "the arm is moved until its tool is outside", _outside_sphere, outside, _at_sphere),
+        untouchable(
+            stop_scenario(
+                5, "outside", "the arm is pulled until its tool is outside", _outside_sphere, outside, _at_sphere
+            )
+        ),
         stop_scenario(12, "one mute", "a drive obeys, but is not heard of", _one_mute, silent),
         stop_scenario(12, "all mute", "no drive is heard of", _all_mute, silent),
         stop_scenario(12, "taking turns", "one drive at a time is heard of", _taking_turns, silent),
         stop_scenario(12, "power lost", "a drive loses its supply", lambda b: unpowered(b, [_some(b)]), dead),
         resuming_scenario(12, "short gap", "no drive is heard of for 30 ms", _all_mute, 0.03),
         stop_scenario(17, "stuck joint", "the fastest joint seizes up", stuck, crash),
-        _untouchable(
-            stop_scenario(17, "stuck slowly", "the same, slowly, with the contact reflex off", stuck, slow, _slowly)
-        ),
+        untouchable(stop_scenario(17, "stuck slowly", "the same, slowly", stuck, slow, _slowly)),
         stop_scenario(17, "stuck encoder", "a joint is measured at rest, but moves on", _unseen, not_seen),
         stop_scenario(17, "wrong direction", "a drive pushes the wrong way", _wrong_way, astray),
         stop_scenario(17, "limp drive", "a drive that is on gives no torque", _limp, astray),

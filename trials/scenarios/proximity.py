@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from robotctl.control.kinematics import Kinematics
 from robotctl.hal.profile import KeepOutBox
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Vector
+from robotctl.safety.region import regions
 from robotctl.safety.shaper import Clip
 from robotctl.safety.trip import Category, Protection
 from robotctl.trials.bench import Bench
@@ -19,7 +21,7 @@ from robotctl.trials.policies import Act
 from robotctl.trials.poses import outside
 from robotctl.trials.scenario import Scenario, Trial
 from robotctl.trials.shaping import clipped, shaped_scenario
-from robotctl.trials.stops import Expected, still, stop_scenario
+from robotctl.trials.stops import Expected, still, stop_scenario, untouchable
 
 _NAME = "obstacle"
 _HALF = 0.05
@@ -29,13 +31,15 @@ _GAP = 0.05
 _FARTHEST = 0.4
 _TOLERANCE = 2e-3
 """By how much the true clearance may fall short of `proximity_stop`, m."""
-_STEP = 5e-4
+_STEP = 2e-4
 _FARTHEST_POSE = 0.8
 """rad from home"""
 _ROOM = 0.02
 """rad and m"""
-_BESIDE = 1e-3
+_BEFORE = 0.03
+_BESIDE = 5e-4
 _PULL_S = 0.4
+_DIRECTIONS = np.array([d for d in product((0.0, 1.0, -1.0), repeat=3) if any(d)])
 
 
 class Obstacle:
@@ -51,7 +55,7 @@ class Obstacle:
         self.kinematics = Kinematics(robot)
         tool = self.kinematics.tool(home)
         for distance in np.arange(_GAP + _HALF, _FARTHEST, 0.02):
-            for direction in np.vstack([np.eye(3), -np.eye(3)]):
+            for direction in _DIRECTIONS:
                 self.centre = tool + distance * direction
                 box = KeepOutBox(kind="box", name=_NAME, centre=tuple(self.centre.tolist()), half=(_HALF,) * 3)
                 profile = robot.profile.model_copy(update={"keep_out": [*robot.profile.keep_out, box]})
@@ -70,7 +74,10 @@ class Obstacle:
             pose = pose + _STEP * self.towards(pose)
             moved = float(np.abs(pose - home).max())
         room = min(float((limits.upper - pose).min()), float((pose - limits.lower).min()))
-        return self.clearance(pose) <= 0.0 and room > _ROOM and outside(self.robot, self.kinematics, pose) < -_ROOM
+        if self.clearance(pose) > 0.0 or room < _ROOM or outside(self.robot, self.kinematics, pose) > -_ROOM:
+            return False
+        # It is to be the arm's links that come near, not the tool point, for which the box is a region (P4, P5).
+        return regions(self.robot.profile)[-1].room(self.kinematics.tool(pose)) > 0.5 * _ROOM
 
     def clearance(self, pose: Vector) -> float:
         """Return the least distance of the arm from the box at a pose (n,), m."""
@@ -109,15 +116,19 @@ def _approach(bench: Bench) -> Act:
     return lambda _time, position: obstacle.towards(position)
 
 
+def _on_the_way(bench: Bench) -> Vector:
+    return _obstacle(str(bench.robot.source)).near(_BEFORE)
+
+
 def _close_by(bench: Bench) -> None:
-    safety = bench.robot.profile.safety
-    bench.place(_obstacle(str(bench.robot.source)).near(safety.proximity_stop + safety.proximity_margin + _BESIDE))
+    stop = bench.robot.profile.safety.proximity_stop
+    bench.place(_obstacle(str(bench.robot.source)).near(stop + _BESIDE))
     still(bench)
 
 
 def _pulled_in(bench: Bench) -> Planted:
     stop = bench.robot.profile.safety.proximity_stop
-    return pulled(bench, _obstacle(str(bench.robot.source)).near(stop - 1e-3), _PULL_S)
+    return pulled(bench, _obstacle(str(bench.robot.source)).near(stop - _BESIDE), _PULL_S)
 
 
 def scenarios(_robot: Robot, _backend: str) -> list[Scenario]:
@@ -132,8 +143,15 @@ def scenarios(_robot: Robot, _backend: str) -> list[Scenario]:
     return [
         _beside(
             shaped_scenario(
-                20, "into an obstacle", "a policy leads the tool to a box", _approach, clipped(Clip.PROXIMITY)
+                20,
+                "into an obstacle",
+                "a policy leads the tool to a box",
+                _approach,
+                clipped(Clip.PROXIMITY),
+                start=_on_the_way,
             )
         ),
-        _beside(stop_scenario(20, "too close", "the arm is moved towards a box", _pulled_in, near, _close_by)),
+        _beside(
+            untouchable(stop_scenario(20, "too close", "the arm is pulled towards a box", _pulled_in, near, _close_by))
+        ),
     ]
