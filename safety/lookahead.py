@@ -49,22 +49,23 @@ class Lookahead:
         bounds = regions(robot.profile, robot.profile.safety.sphere_margin)
         self._regions = list(zip(bounds, [Clip.SPHERE] + (len(bounds) - 1) * [Clip.KEEP_OUT], strict=True))
         usable = (1.0 - robot.profile.safety.cap_margin) * robot.limits.acceleration
-        # How long each joint brakes for per rad/s (n,), on the way to each pose.
-        self._braking = [np.zeros(robot.dof)] + [1.0 / (share * usable) for share in BRAKE_SHARES]
-        self._proximity = [ProximityLimit(robot, scene or NothingNear(robot.dof)) for _ in self._braking]
+        # How long each joint brakes for per rad/s, on the way to each pose (3, n).
+        self._braking = np.array([np.zeros(robot.dof)] + [1.0 / (share * usable) for share in BRAKE_SHARES])
+        self._proximity = ProximityLimit(robot, scene or NothingNear(robot.dof))
 
     def rows(self, position: Vector, velocity: Vector) -> Rows:
         """Return the rows for a motion, joint positions (n,), rad, and velocities (n,), rad/s."""
-        normals, bounds, flags = [], [], []
-        for braking, proximity in zip(self._braking, self._proximity, strict=True):
-            rest = braking * np.abs(velocity)
-            pose = position + (self._reaction + 0.5 * rest) * velocity
-            point, jacobian = self._model.tool_and_jacobian(pose)
+        rest = self._braking * np.abs(velocity)
+        poses = position + (self._reaction + 0.5 * rest) * velocity
+        normals, bounds, flags, at = [], [], [], []
+        for index, links in enumerate(self._proximity.rows(poses)):
+            point, jacobian = self._model.tool_and_jacobian(poses[index])
             found = [(region.row(point, jacobian), flag) for region, flag in self._regions]
-            found += [(row, Clip.PROXIMITY) for row in proximity.look(pose)[0]]
-            for row, flag in found:
+            for row, flag in found + [(row, Clip.PROXIMITY) for row in links]:
                 if row is not None:
-                    normals.append(row.normal * (self._reaction + rest))
-                    bounds.append(row.bound - row.normal @ velocity)
+                    normals.append(row.normal)
+                    bounds.append(row.bound)
                     flags.append(flag)
-        return Rows(np.array(normals).reshape(len(normals), len(position)), np.array(bounds), flags)
+                    at.append(index)
+        here = np.array(normals).reshape(-1, len(position))
+        return Rows(here * (self._reaction + rest[at]), np.array(bounds) - here @ velocity, flags)

@@ -106,10 +106,17 @@ class ProximityLimit:
         A pair that is too near already may get no nearer.
         """
         clearances = self._here.at(position[np.newaxis], self._slow)[0]
+        return self._rows(position, clearances), np.minimum(clearances, self._stop) - _ROUNDING
+
+    def rows(self, poses: Vector) -> list[list[Row]]:
+        """Return the rows of the pairs that are near, at each of some poses (k, n) ahead."""
+        clearances = self._ahead.at(poses, self._slow)
+        return [self._rows(pose, clearance) for pose, clearance in zip(poses, clearances, strict=True)]
+
+    def _rows(self, position: Vector, clearances: Vector) -> list[Row]:
         near = np.flatnonzero(clearances < self._slow).tolist()
         slopes = self._scene.approach(position, near) if near else ()
-        rows = [Row.keeping(clearances[near[i]] - self._stop, self._gain, slope) for i, slope in enumerate(slopes)]
-        return rows, np.minimum(clearances, self._stop) - _ROUNDING
+        return [Row.keeping(clearances[near[i]] - self._stop, self._gain, slope) for i, slope in enumerate(slopes)]
 
     def clear(self, position: Vector, way: Vector, required: Vector) -> bool:
         """Return whether no way that moves no joint further than `way` (n,) can take a pair its required clearance."""
