@@ -27,6 +27,7 @@ _DRIFT = 0.02
 """rad; more is a motion."""
 _LONGEST_REST_S = 3.0
 _SLACK_TICKS = 2
+_NEVER_S = 1e3
 
 _STOPPED = (State.HOLD, State.FAULT)
 
@@ -110,7 +111,7 @@ def untouchable(scenario: Scenario) -> Scenario:
     """Return a scenario without the contact reflex, which would be quicker: what stands behind it is tried."""
 
     def run(robot: Robot, backend: str, seed: int) -> Trial:
-        numb = robot.profile.safety.model_copy(update={"contact": 1.0})
+        numb = robot.profile.safety.model_copy(update={"contact_time_s": _NEVER_S})
         return scenario.run(replace(robot, profile=robot.profile.model_copy(update={"safety": numb})), backend, seed)
 
     return replace(scenario, provoked=f"{scenario.provoked}; the contact reflex is off", run=run)

@@ -933,7 +933,7 @@ def test_a_drive_that_gets_hot_is_warned_of_once(bench):
 
 
 def test_an_arm_that_is_pushed_stops_and_gives_way():
-    bench = Bench(load_robot("panda", ["safety.contact=0.15"]))
+    bench = Bench(load_robot("panda"))
     bench.reach(State.ARMED)
     assert bench.ask(Verb.START) == ""
     for _ in range(20):

@@ -5,6 +5,7 @@ import numpy as np
 from robotctl.control.kinematics import Kinematics
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Vector
+from robotctl.safety.contact import ContactReflex
 from robotctl.safety.trip import Category, Protection
 from robotctl.trials.bench import Bench
 from robotctl.trials.faults import Planted, pushed, resisted
@@ -29,7 +30,7 @@ _FAST = 0.7
 
 def _least(robot: Robot) -> Vector:
     """Return the torques (n,) that count as contact, Nm."""
-    return robot.profile.safety.contact * robot.limits.torque
+    return ContactReflex(robot).threshold
 
 
 def _heaviest(robot: Robot) -> tuple[int, float]:
