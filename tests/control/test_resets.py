@@ -112,9 +112,9 @@ def test_a_trip_on_the_way_is_not_tried_again_and_calls_for_the_operator(panda: 
     session._rig.arm._plant.jam(0, jammed=True)
     with pytest.raises(Stopped, match="panda_joint1"):
         session.wait_for(State.ARMED, timeout_s=60.0)
-    assert session.state is State.FAULT
-    assert [trip["protection"] for trip in session.trips] == ["P17"]
-    assert [page.split(":")[0] for page in session.pages] == ["P17"]
+    assert session.state is State.HOLD
+    assert [trip["protection"] for trip in session.trips] == ["P19"]
+    assert [page.split(":")[0] for page in session.pages] == ["P19"]
 
 
 @pytest.mark.parametrize("how", ["estop", "policy"])

@@ -70,19 +70,19 @@ def test_goto_arrives_within_its_caps(robot: Robot, kinematics: Kinematics):
         np.linalg.norm(kinematics.tool_and_jacobian(position)[1] @ wish)
         for position, wish in zip(positions, wishes, strict=False)
     ]
-    assert max(speeds) <= safety.reset_tool_speed * (1 + 1e-9)
+    assert max(speeds) <= 0.8 * safety.reset_tool_speed * (1 + 1e-9)
     # One of the two caps is in use somewhere, else neither was tested.
     scale = (np.abs(wishes) / (safety.reset_scale * robot.limits.velocity)).max()
-    assert scale > 0.999 or max(speeds) > 0.999 * safety.reset_tool_speed
+    assert scale > 0.999 or max(speeds) > 0.799 * safety.reset_tool_speed
 
 
 @pytest.mark.parametrize("tool_speed", [0.02, 0.1])
-def test_goto_keeps_to_the_tool_speed_where_that_is_the_tighter_cap(tool_speed):
+def test_goto_aims_at_four_fifths_of_the_tool_speed_where_that_is_the_tighter_cap(tool_speed):
     robot = load_robot("panda", [f"safety.reset_tool_speed={tool_speed}"])
     kinematics, home = Kinematics(robot), np.array(robot.profile.home)
     start = home + np.array([-0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     wish = Goto(robot, home, "home", kinematics).velocity(sample(start), start)
-    assert np.linalg.norm(kinematics.tool_and_jacobian(start)[1] @ wish) == pytest.approx(tool_speed)
+    assert np.linalg.norm(kinematics.tool_and_jacobian(start)[1] @ wish) == pytest.approx(0.8 * tool_speed)
 
 
 def test_goto_leads_along_a_straight_line(panda: Robot):
