@@ -10,6 +10,7 @@ from robotctl.control.neighbours import Neighbours
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.admission import Admission
 from robotctl.safety.believable import Believable
+from robotctl.safety.contact import ContactReflex
 from robotctl.safety.deadman import Deadman
 from robotctl.safety.drives import BusHealth, DriveHealth
 from robotctl.safety.guard import Guard
@@ -87,13 +88,14 @@ MUTATIONS = {
     16: [(Guard, "command", no_words)],
     17: [(TrackingError, "check", nothing)],
     18: [(Overspeed, "check", nothing)],
+    19: [(ContactReflex, "check", nothing)],
     20: [(ProximityBreach, "check", nothing)],
     21: [(Guard, "command", no_words)],
     22: [(Deadman, "check", nothing)],
     23: [(Bench, "ask", no_words)],
     24: [(DriveHealth, "check", nothing)],
     26: [(WeightsGate, "offer", nothing)],
-    29: [(TrackingError, "check", nothing)],
+    29: [(TrackingError, "check", nothing), (ContactReflex, "check", nothing)],
     30: [(Neighbours, "check", nothing)],
 }
 """What each protection is switched off with."""
