@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,7 @@ from robotctl.cli.output import write_json
 from robotctl.control.benchmark import bench_tick
 from robotctl.hal.robot import Robot, load_robot, robot_names
 from robotctl.sim.plant import PHYSICS_STEP_NS, Plant
+from robotctl.trials.cost import MODES, POLICIES, bench_safety
 from robotctl.trials.soak import cases, soak
 
 bench_app = typer.Typer(help="Measure what things cost.", no_args_is_help=True)
@@ -51,6 +53,28 @@ def tick(
             console.print(table)
         if json is not None:
             write_json(json, reports)
+
+
+@bench_app.command()
+def safety(
+    robot: Annotated[str, typer.Option(help="Robot to measure.")] = "panda",
+    ticks: Annotated[int, typer.Option(min=1000, help="Servo periods of each measurement.")] = 10_000,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
+) -> None:
+    """Time every call of the shaper and of the guard, on both backends, under hostile policies."""
+    table = Table(title=f"{robot}, microseconds")
+    for column in ("backend", "mode", "policy", "shaper p50", "p99", "guard p50", "p99"):
+        table.add_column(column, justify="right" if "p" in column[-3:] else "left")
+    with readable_errors():
+        model, reports = load_robot(robot), []
+        for backend, mode, policy in product(["sim", "can"] if model.profile.can else ["sim"], MODES, POLICIES):
+            report = bench_safety(model, backend, mode, policy, ticks)
+            reports.append(report)
+            costs = [report[layer][share] for layer in ("shaper", "guard") for share in ("p50", "p99")]
+            table.add_row(backend, mode, policy, *(f"{cost:.1f}" for cost in costs))
+        Console(highlight=False).print(table)
+        if json is not None:
+            write_json(json, {"robot": robot, "ticks": ticks, "measurements": reports})
 
 
 @bench_app.command("soak")

@@ -206,7 +206,7 @@ class Safety(_Strict):
     overspeed_cut: Annotated[float, Field(gt=1.0)] = 1.5
     """Multiple of a velocity cap at which its torque is taken away."""
     contact: Annotated[float, Field(gt=0.0, le=1.0)] = 0.6
-    """Torque from outside that counts as contact, as a share of what would take a joint off its track, or to its cap ..."""
+    """Torque from outside that counts as contact, as a share of what takes a joint off its track or to its cap ..."""
     contact_time_s: Positive = 0.02
     """... if it lasts for so long."""
     bump: Positive = 0.02

@@ -35,7 +35,7 @@ class ContactReflex:
         if stamp_ns - self._since_ns < self._patience_ns:
             return None
         cause = (
-            f"{self._names[joint]} feels {external[joint]:.1f} Nm from outside, {self.threshold[joint]:.1f} are allowed; "
-            "it yields until it is let go; clear its way, then acknowledge"
+            f"{self._names[joint]} feels {external[joint]:.1f} Nm from outside, {self.threshold[joint]:.1f} are "
+            "allowed; it yields until it is let go; clear its way, then acknowledge"
         )
         return Trip(Protection.CONTACT, Category.BRAKE_HOLD, cause, stamp_ns)

@@ -32,7 +32,7 @@ _RETREAT_DEPTH = 0.01
 _CLEARANCE = 2e-3
 """Beyond what the shaper keeps, m. No more, since some links are never far from each other."""
 _AIM = 0.8
-"""Share of the tool's largest speed that a motion aims at: where joints part on their way, it is faster than planned."""
+"""Share of the tool's largest speed that a motion aims at. Joints that start apart make it faster than that."""
 _START_ROOM = 0.02
 """How far inside every region the tool is at a random start, m."""
 _DRAWS = 100

@@ -92,6 +92,16 @@ def run(case: Case) -> dict[str, Any]:
         }
 
 
+def put_action(session: LockstepSession, mode: str, seq: int, action: Vector) -> None:
+    """Ask for an action (n,) in -1..1, in a mode of `MODES`: more than the velocity caps, or all of the torque caps."""
+    stamp = (int(session.latest()["epoch"]), seq, session.clock.now_ns() + _VALID_NS)
+    limits, mailbox = session.robot.limits, session.link.mailbox
+    if mode == "velocity":
+        mailbox.put(JointVelocity(EXCESS * action * limits.velocity, *stamp))
+    else:
+        mailbox.put(JointTorque(action * limits.torque, *stamp))
+
+
 class _Soaker:
     def __init__(self, session: LockstepSession, case: Case) -> None:
         self._session = session
@@ -124,17 +134,9 @@ class _Soaker:
                 self._search.judge(self.closest())
                 attempted = now
             record = session.latest()
-            self._put(self._act((now - attempted) * 1e-9, record["position"]))
+            self._seq += 1
+            put_action(session, self._case.mode, self._seq, self._act((now - attempted) * 1e-9, record["position"]))
             session.advance(POLICY_S)
-
-    def _put(self, action: Vector) -> None:
-        self._seq += 1
-        stamp = (int(self._session.latest()["epoch"]), self._seq, self._session.clock.now_ns() + _VALID_NS)
-        limits, mailbox = self._robot.limits, self._session.link.mailbox
-        if self._case.mode == "velocity":
-            mailbox.put(JointVelocity(EXCESS * action * limits.velocity, *stamp))
-        else:
-            mailbox.put(JointTorque(action * limits.torque, *stamp))
 
     def _recover(self) -> None:
         """Do what an operator does: acknowledge and go home, back inside first where that is asked for.
