@@ -67,5 +67,5 @@ class Lookahead:
                     bounds.append(row.bound)
                     flags.append(flag)
                     at.append(index)
-        here = np.array(normals).reshape(-1, len(position))
+        here = np.array(normals).reshape(len(normals), len(position))
         return Rows(here * (self._reaction + rest[at]), np.array(bounds) - here @ velocity, flags)

@@ -26,7 +26,7 @@ from robotctl.safety.region import Region, Row, regions
 
 _SOFT = 8
 """daqp's sense of a constraint that gives way, at a price, rather than make the problem infeasible."""
-_SOLVED = (1, 2)
+SOLVED = (1, 2)
 """daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
 
 
@@ -180,7 +180,7 @@ class Shaper:
         least = np.concatenate([lower, np.full(len(rows), -np.inf)])
         for sense in self._senses:
             solution, _, flag, _ = daqp.solve(self._hessian, -wanted, normals, most, least, sense[: len(most)])
-            if flag in _SOLVED:
+            if flag in SOLVED:
                 return np.asarray(np.minimum(np.maximum(solution, lower), upper))
         return np.minimum(np.maximum(np.zeros(self._n), lower), upper)
 

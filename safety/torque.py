@@ -23,14 +23,9 @@ from robotctl.hal.types import Vector
 from robotctl.safety.box import JointBox
 from robotctl.safety.lookahead import BRAKE_SHARES, Geometry, Lookahead
 from robotctl.safety.proximity import Scene
-from robotctl.safety.shaper import Clip
+from robotctl.safety.shaper import SOLVED, Clip
 
 _REACTION_S = 0.02
-_UNBOUNDED = 1e30
-_SOFT = 8
-"""daqp's sense of a constraint that may give way."""
-_SOLVED = (1, 2)
-"""daqp's exit flags for an optimum, and for an optimum with a softened constraint."""
 
 
 class Dynamics(Geometry, Protocol):
@@ -107,7 +102,7 @@ class TorqueShaper:
         free = rows @ load
         least, most = (slowest - velocity) / self._reaction, (fastest - velocity) / self._reaction
         lower = np.concatenate([np.maximum(-self._cap, state.effort - self._step), least + free[:n]])
-        lower = np.concatenate([lower, np.full(len(bounds), -_UNBOUNDED)])
+        lower = np.concatenate([lower, np.full(len(bounds), -np.inf)])
         upper = np.concatenate([np.minimum(self._cap, state.effort + self._step), most + free[:n], bounds + free[n:]])
         result = np.concatenate([wanted, rows @ wanted])
         broken = (result > upper) | (result < lower)
@@ -128,11 +123,10 @@ class TorqueShaper:
 def _solve(wanted: Vector, mobility: Vector, rows: Vector, lower: Vector, upper: Vector) -> Vector | None:
     """Return the torque closest to the wanted one: itself bounded first, then the result of each row."""
     n = len(wanted)
-    sense = np.full(len(upper), _SOFT, dtype=np.int32)
-    sense[:n] = 0
+    sense = np.zeros(len(upper), dtype=np.int32)  # below the first level they give way all the same
     levels = np.array([n, 2 * n, len(upper)], dtype=np.int32)
     torque, _, flag, _ = daqp.solve(mobility, -mobility @ wanted, rows, upper, lower, sense, levels)
-    return torque if flag in _SOLVED else None
+    return torque if flag in SOLVED else None
 
 
 def _passed(velocity: Vector, following: Vector, slowest: Vector, fastest: Vector, box: JointBox) -> Clip:

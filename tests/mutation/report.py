@@ -22,7 +22,14 @@ class Excuse(NamedTuple):
     reason: str
 
 
-EXCUSED: tuple[Excuse, ...] = ()
+EXCUSED: tuple[Excuse, ...] = (
+    Excuse(
+        "guard.py",
+        "self._passed = False",
+        "False -> True",
+        "before the first motion there is no time that could be used up, so nothing is taken off",
+    ),
+)
 
 
 def report(done: Sequence[Case], excuses: Sequence[Excuse], seconds: float, path: Path | None = None) -> int:

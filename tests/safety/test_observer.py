@@ -111,3 +111,52 @@ def test_the_present_is_the_sample_led_on_by_its_age(observer, kinematics, panda
     position, now = observer.present(late, push)
     assert now == pytest.approx(velocity + 2e-3 * 2.0, abs=1e-3)
     assert position == pytest.approx(home + 2e-3 * (velocity + 2e-3), abs=1e-5)
+
+
+class Dragged:
+    """Joints of 2 kg m^2 without coupling, whose viscous friction is large."""
+
+    damping = np.full(7, 50.0)
+
+    def mass_matrix(self, position):
+        return 2.0 * np.eye(7)
+
+    def coriolis(self, position, velocity):
+        return np.zeros((7, 7))
+
+    def gravity(self, position):
+        return np.full(7, 4.0)
+
+    def bias(self, position, velocity):
+        return self.gravity(position)
+
+
+def test_viscous_friction_is_known(panda):
+    observer, velocity = MomentumObserver(7, Dragged()), np.full(7, 0.2)
+    for tick in range(50):
+        found = observer.step(sample(tick * TICK, AT_REST + tick * 4e-4, velocity, np.full(7, 4.0 + 10.0)))
+    assert found == pytest.approx(AT_REST, abs=1e-9)
+
+
+@pytest.mark.parametrize(("ages_ms", "goes_on"), [((2, 4), True), ((2, 12), False), ((0, 4), False), ((-1, 2), False)])
+def test_every_joint_has_to_be_heard_of_again_and_soon(ages_ms, goes_on):
+    observer = MomentumObserver(7, Dragged())
+    pushed, begun = np.full(7, 4.0 - 1.0), np.full(7, 100 * TICK)
+    for tick in range(101):
+        before = observer.step(sample(tick * TICK, AT_REST, AT_REST, pushed))
+    stamps = begun + 1_000_000 * np.array([ages_ms[0]] * 6 + [ages_ms[1]])
+    found = observer.step(sample(int(stamps.max()), AT_REST, AT_REST, pushed + 3.0, stamps=stamps))
+    assert (found is not before) is goes_on
+
+
+@pytest.mark.parametrize("external", [-3.0, 3.0])
+def test_what_was_observed_and_what_rubs_act_until_now(external):
+    """Per joint by itself: (M + age D) dv = age (tau + r - g - D v), and half of dv acts on the way."""
+    observer, velocity, torque = MomentumObserver(7, Dragged()), np.full(7, 0.2), np.full(7, 30.0)
+    observer.external = np.full(7, external)
+    ages = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 20.0]) * 1e-3
+    stamps = 100_000_000 - np.round(1e9 * ages).astype(np.int64)
+    position, now = observer.present(sample(100_000_000, AT_REST, velocity, torque, stamps=stamps), torque)
+    change = ages * (30.0 + external - 4.0 - 10.0) / (2.0 + ages * 50.0)
+    assert now == pytest.approx(velocity + change)
+    assert position == pytest.approx(ages * (velocity + 0.5 * change))

@@ -6,6 +6,8 @@ import pytest
 
 from robotctl.control.kinematics import Kinematics
 from robotctl.hal.robot import load_robot
+from robotctl.safety.box import JointBox
+from robotctl.safety.lookahead import Lookahead
 from robotctl.safety.shaper import Clip
 from robotctl.safety.torque import ArmState, TorqueShaper
 
@@ -161,3 +163,135 @@ def test_at_the_centre_of_its_sphere_a_tool_is_free(kinematics):
     torque, clip = TorqueShaper(robot, kinematics).push(moving, moving.effort)
     assert torque is moving.effort
     assert clip is Clip.NONE
+
+
+# -- joints that know nothing of each other ------------------------------------------------------------------------
+
+
+class Loose:
+    """Joints without coupling; the tool goes along x with the first one, at half its angle."""
+
+    damping = np.linspace(0.2, 2.0, 7)
+    reach = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def mass(self, position):
+        return 0.1 + 0.05 * np.sin(20.0 * position) ** 2
+
+    def mass_matrix(self, position):
+        return np.diag(self.mass(position))
+
+    def bias(self, position, velocity):
+        return 3.0 * position + 0.3 * velocity**2
+
+    def tool(self, position):
+        return np.array([0.5 * position[0], 0.0, 0.5])
+
+    def tool_and_jacobian(self, position):
+        jacobian = np.zeros((3, 7))
+        jacobian[0, 0] = 0.5
+        return self.tool(position), jacobian
+
+
+LAG, DELAY = 0.013, 0.004
+LOOSE = Loose()
+
+
+def loose_robot(*settings):
+    return load_robot("panda", [f"twin.lag_s={LAG}", f"twin.delay_s={DELAY}", *settings])
+
+
+def by_hand(robot, moving, wanted):
+    """Torque (n,) and clip, a joint at a time: as close to the wanted one as acceleration and then torque allow."""
+    reaction, usable = 0.02 + LAG + DELAY, 1.0 - robot.profile.safety.cap_margin
+    position, velocity, effort, external = moving
+    middle = position + 1e-3 * velocity
+    mass = LOOSE.mass(middle) + 2e-3 * LOOSE.damping
+    load = LOOSE.bias(middle, velocity) + LOOSE.damping * velocity - external
+    box = JointBox(robot, reaction, usable, brake_share=0.5, pull=0.25 / reaction)
+    slowest, fastest = box.bounds(position, velocity)
+    most_torque = np.minimum(robot.limits.torque, effort + 2e-3 * robot.limits.torque_rate)
+    least_torque = np.maximum(-robot.limits.torque, effort - 2e-3 * robot.limits.torque_rate)
+    torque = np.clip(
+        wanted, load + mass * (slowest - velocity) / reaction, load + mass * (fastest - velocity) / reaction
+    )
+    clip = Clip.NONE
+    for joint in range(7):
+        following = velocity[joint] + reaction * (wanted[joint] - load[joint]) / mass[joint]
+        cap, step = usable * robot.limits.velocity[joint], usable * robot.limits.acceleration[joint] * reaction
+        if not least_torque[joint] <= wanted[joint] <= most_torque[joint]:
+            clip |= Clip.TORQUE
+        if abs(following) > cap:
+            clip |= Clip.VELOCITY
+        if abs(following - velocity[joint]) > step:
+            clip |= Clip.ACCELERATION
+        for side, bound in ((1.0, fastest[joint]), (-1.0, -slowest[joint])):
+            if side * following > bound and bound < min(cap, side * velocity[joint] + step):
+                clip |= Clip.POSITION
+    return np.clip(torque, least_torque, most_torque), clip
+
+
+def loose_motion(rng, robot, near):
+    limits = robot.limits
+    position = rng.uniform(-0.5, 0.5, 7)
+    if near:
+        side = rng.random(7) < 0.5
+        position = np.where(side, limits.upper, limits.lower) + rng.uniform(-0.05, 0.05, 7)
+    velocity = rng.uniform(-0.99, 0.99, 7) * limits.velocity
+    load = LOOSE.bias(position, velocity) + LOOSE.damping * velocity
+    effort = np.clip(load + rng.uniform(-4.0, 4.0, 7), -limits.torque, limits.torque)
+    return ArmState(position, velocity, effort, rng.uniform(-1.0, 1.0, 7))
+
+
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("near", [False, True])
+@pytest.mark.parametrize("spread", [0.3, 5.0])
+def test_without_coupling_each_joint_gets_what_is_right_for_it(seed, near, spread):
+    robot = loose_robot("sphere.centre=[0.0, 0.0, 0.0]", "sphere.radius=20.0")
+    rng = np.random.default_rng(seed)
+    moving = loose_motion(rng, robot, near)
+    wanted = moving.effort + rng.uniform(-spread, spread, 7)
+    torque, clip = TorqueShaper(robot, LOOSE).push(moving, wanted)
+    expected, why = by_hand(robot, moving, wanted)
+    assert torque == pytest.approx(expected, abs=1e-6)
+    assert clip == why
+
+
+@pytest.mark.parametrize("joint", range(7))
+@pytest.mark.parametrize("case", ["free", "torque", "velocity", "acceleration", "position"])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_clip_tells_which_limit_one_joint_would_have_passed(joint, case, side):
+    robot = loose_robot("sphere.centre=[0.0, 0.0, 0.0]", "sphere.radius=20.0")
+    position, velocity, wanted = middle(PANDA), np.zeros(7), np.zeros(7)
+    match case:
+        case "torque":
+            wanted[joint] = side * (2e-3 * robot.limits.torque_rate[joint] + 1e-3)
+        case "velocity":
+            velocity[joint] = side * robot.limits.velocity[joint] * 0.99
+        case "acceleration":
+            wanted[joint] = side * 0.15 * robot.limits.acceleration[joint]
+        case "position":
+            velocity[joint] = side * 0.3
+            position[joint] = (robot.limits.upper if side > 0 else robot.limits.lower)[joint] - side * 0.02
+    load = LOOSE.bias(position, velocity) + LOOSE.damping * velocity
+    moving = ArmState(position, velocity, load, np.zeros(7))
+    torque, clip = TorqueShaper(robot, LOOSE).push(moving, load + wanted)
+    expected, why = by_hand(robot, moving, load + wanted)
+    assert torque == pytest.approx(expected, abs=1e-6)
+    assert clip == why
+    if case != "free":
+        assert Clip[case.upper()] in clip
+
+
+@pytest.mark.parametrize("room", [0.0, 1e-3, 4e-3, 8e-3])
+def test_a_tool_is_braked_by_just_what_its_sphere_demands(room):
+    robot = loose_robot("sphere.centre=[-1.0, 0.0, 0.5]", f"sphere.radius={1.05 + 5e-3 + room}")
+    velocity = np.array([0.05, *REST[1:]])
+    moving = ArmState(np.array([0.1, *REST[1:]]), velocity, np.array([0.3, *REST[1:]]), REST)
+    middle = moving.position + 1e-3 * velocity
+    mass = LOOSE.mass(middle)[0] + 2e-3 * LOOSE.damping[0]
+    load = LOOSE.bias(middle, velocity)[0] + LOOSE.damping[0] * velocity[0]
+    ahead = Lookahead(robot, LOOSE, 0.02 + LAG + DELAY, None).rows(moving.position, velocity)
+    most = min(bound / normal[0] for normal, bound in zip(ahead.normals, ahead.bounds, strict=True))
+    torque, clip = TorqueShaper(robot, LOOSE).push(moving, moving.effort + np.array([1.9, *REST[1:]]))
+    assert Clip.SPHERE in clip
+    assert torque[0] == pytest.approx(load + mass * most, abs=1e-6)
