@@ -102,7 +102,10 @@ def soak_(
             mark = "[red]found[/]" if found else "[green]none [/]"
             worst = "  ".join(f"{key} {1e3 * value:+.1f}" for key, value in result["worst"].items())
             what = f"{result['robot']:8s} {result['mode']:8s} {result['policy']:9s} {result['ticks']:8d} ticks"
-            console.print(f"{done:3d}/{len(todo)}  {mark}  {what}  {worst}  stops {result['trips'] or 'none'}")
+            console.print(
+                f"{done:3d}/{len(todo)}  {mark}  {what}  {worst}  stops {result['trips'] or 'none'}"
+                + (f", freed {result['freed']} times" if result["freed"] else "")
+            )
             if result["ended"]:
                 console.print(f"    ended: {result['ended_by']}", markup=False)
         total = sum(result["ticks"] for result in results)

@@ -32,7 +32,13 @@ _RETREAT_DEPTH = 0.01
 _CLEARANCE = 2e-3
 """Beyond what the shaper keeps, m. No more, since some links are never far from each other."""
 _AIM = 0.8
-"""Share of the tool's largest speed that a motion aims at. Joints that start apart make it faster than that."""
+"""Share of the tool's largest speed that a motion aims at ..."""
+_FAST = 0.9
+"""... and above which it slows down, in every tick to ..."""
+_SLOWER = 0.8
+"""... so much, until it may get faster again, in every tick by ..."""
+_FASTER = 0.005
+"""... so much of its pace."""
 _START_ROOM = 0.02
 """How far inside every region the tool is at a random start, m."""
 _DRAWS = 100
@@ -116,8 +122,9 @@ class Goto(Routine):
         self.name = name
         self._pose = pose
         self._cap = safety.reset_scale * robot.limits.velocity
-        self._tool_speed = _AIM * safety.reset_tool_speed
+        self._tool_speed = safety.reset_tool_speed
         self._geometry = geometry
+        self._pace = 1.0
 
     def velocity(self, sample: Sample, position: Vector) -> Vector | None:
         error = self._pose - position
@@ -125,8 +132,11 @@ class Goto(Routine):
             return None
         wanted = _GAIN * error
         _, jacobian = self._geometry.tool_and_jacobian(position)
-        speed = float(np.linalg.norm(jacobian @ wanted)) / self._tool_speed
-        return wanted / max(1.0, speed, float((np.abs(wanted) / self._cap).max()))
+        # Where it slides along a bound, the shaper leads joints another way than they want, and the tool may get fast.
+        hurry = float(np.linalg.norm(jacobian @ sample.velocity)) > _FAST * self._tool_speed
+        self._pace = _SLOWER * self._pace if hurry else min(self._pace + _FASTER, 1.0)
+        speed = float(np.linalg.norm(jacobian @ wanted)) / (_AIM * self._tool_speed)
+        return wanted * (self._pace / max(1.0, speed, float((np.abs(wanted) / self._cap).max())))
 
 
 class RandomStart(Goto):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from robotctl.control.loop import Loop
 from robotctl.control.operator import Verb
 from robotctl.control.shared import Link
+from robotctl.hal.arm import Arm
 from robotctl.hal.backend import Rig, open_backend
 from robotctl.hal.can.damiao.arm import DamiaoArm
 from robotctl.hal.clock import VirtualClock
@@ -33,6 +34,26 @@ _SETTLE_S = 0.05
 
 Policy = Callable[["Bench", float], Target | None]
 """What the bench's policy wants at a time, s since it began; None for silence."""
+
+
+def emulated_bus(arm: Arm) -> EmulatedBus | None:
+    """Return the emulated bus that an arm is on, if it is on one."""
+    channel = arm.channel if isinstance(arm, DamiaoArm) else None
+    return channel.bus if channel is not None and isinstance(channel.bus, EmulatedBus) else None
+
+
+def plant_behind(arm: Arm) -> Plant:
+    """Return the plant that an arm moves.
+
+    Raises:
+        HardwareError: if it is a real one.
+    """
+    if isinstance(arm, SimArm):
+        return arm.plant
+    bus = emulated_bus(arm)
+    if bus is None:
+        raise HardwareError("there is no plant behind this arm")
+    return bus.bench.plant
 
 
 class Bench:
@@ -80,9 +101,7 @@ class Bench:
     @property
     def bus(self) -> EmulatedBus | None:
         """The bus, if the arm is on emulated motors."""
-        arm = self._rig.arm
-        channel = arm.channel if isinstance(arm, DamiaoArm) else None
-        return channel.bus if channel is not None and isinstance(channel.bus, EmulatedBus) else None
+        return emulated_bus(self._rig.arm)
 
     @property
     def motors(self) -> Motors:
@@ -93,7 +112,7 @@ class Bench:
 
     @property
     def plant(self) -> Plant:
-        return self.twin.plant if self.twin else self.motors.plant
+        return plant_behind(self._rig.arm)
 
     # -- time -----------------------------------------------------------------------------------------------------
 

@@ -22,6 +22,9 @@ from robotctl.hal.types import Vector
 from robotctl.safety.machine import State
 from robotctl.safety.shaper import Clip
 from robotctl.safety.target import JointTorque, JointVelocity
+from robotctl.safety.trip import Protection
+from robotctl.sim.plant import Plant
+from robotctl.trials.bench import plant_behind
 from robotctl.trials.policies import EXCESS, Act, bang_bang, outward, random
 from robotctl.trials.search import Search
 
@@ -34,6 +37,7 @@ _ATTEMPT_S = 2.0
 _VALID_NS = 100_000_000
 _GUARD = frozenset({"P1", "P2", "P6", "P7", "P16", "P21"})
 _LOWERING_S = 2.5
+_SETTLE_S = 0.2
 _PIECE = 250_000
 """Ticks of one job: short enough that all cores are busy to the end."""
 
@@ -86,6 +90,7 @@ def run(case: Case) -> dict[str, Any]:
             "violations": dict(session.judge.violations),
             "worst": soaker.worst,
             "trips": dict(trips),
+            "freed": soaker.freed,
             "guard_trips": sum(trips[protection] for protection in _GUARD),
             "ended": ended,
             "ended_by": session.trips[-1]["text"] if ended and session.trips else "",
@@ -111,6 +116,8 @@ class _Soaker:
         self._search = Search(self._robot.dof, self._rng) if case.policy == "search" else None
         self._act = self._policy()
         self._seq = 0
+        self.freed = 0
+        """How often the arm could not get home by itself."""
         self.worst: dict[str, float] = {}
         """Largest excess over each limit so far; negative: that far inside."""
 
@@ -159,7 +166,31 @@ class _Soaker:
         session.advance(self._robot.period_ns * 1e-9)
         if session.latest()["clip"] & Clip.RECOVERY:
             session.reset(Verb.RETREAT)
+        try:
+            session.reset()
+        except Stopped:
+            if session.trips[-1]["protection"] != Protection.RESET.label:
+                raise
+            self._free()
+
+    def _free(self) -> None:
+        """Lead the arm home by hand, its drives off, where no straight way leads there, and set it up again."""
+        session = self._session
+        session.request(Verb.ACK)
+        session.request(Verb.DISARM)
+        session.wait_for(State.READY, timeout_s=10.0)
+        plant = plant_behind(session._rig.arm)
+        self._hold(plant, held=True)
+        plant.place(np.array(self._robot.profile.home))
+        session.advance(_SETTLE_S)
+        session.request(Verb.ARM)
+        self._hold(plant, held=False)
+        self.freed += 1
         session.reset()
+
+    def _hold(self, plant: Plant, *, held: bool) -> None:
+        for axis in range(self._robot.dof):
+            plant.jam(axis, jammed=held)
 
     def closest(self) -> float:
         """Return how close to any limit the arm came since the last call, as a share of what would be far past it."""

@@ -94,6 +94,22 @@ def test_goto_leads_along_a_straight_line(panda: Robot):
     assert wanted[0] < 0.0 < wanted[6]
 
 
+def test_goto_slows_down_where_the_tool_gets_faster_than_it_was_to(panda: Robot):
+    """The shaper may lead joints another way than they want, as along a sphere, and the tool with them."""
+    kinematics, home = Kinematics(panda), np.array(panda.profile.home)
+    start = home + np.array([-0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    routine = Goto(panda, home, "home", kinematics)
+    full = routine.velocity(sample(start), start)
+    _, jacobian = kinematics.tool_and_jacobian(start)
+    turning = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    turning *= panda.profile.safety.reset_tool_speed / np.linalg.norm(jacobian @ turning)
+    for share, pace in [(0.89, 1.0), (0.91, 0.8), (0.91, 0.64), (0.89, 0.645), (0.0, 0.65)]:
+        assert routine.velocity(sample(start, share * turning), start) == pytest.approx(pace * full)
+    for _ in range(100):
+        wanted = routine.velocity(sample(start), start)
+    assert wanted == pytest.approx(full)
+
+
 @pytest.mark.parametrize(("distance", "done"), [(1.9e-3, True), (2.1e-3, False)])
 def test_goto_is_done_when_it_has_arrived(panda: Robot, distance, done):
     home = np.array(panda.profile.home)

@@ -3,6 +3,8 @@
 import pytest
 
 from robotctl.hal.robot import robot_names
+from robotctl.safety.routines import Goto
+from robotctl.trials import soak
 from robotctl.trials.soak import POLICIES, Case, cases, run
 
 TICKS = 4_700
@@ -30,3 +32,13 @@ def test_the_ticks_are_shared_evenly() -> None:
                 mine = [case for case in shared if (case.robot, case.mode, case.policy) == (robot, mode, policy)]
                 assert sum(case.ticks for case in mine) == 250_000
     assert len({(case.robot, case.mode, case.policy, case.seed) for case in shared}) == len(shared)
+
+
+def test_an_arm_that_finds_no_way_home_is_freed_by_hand_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(soak, "_EPISODE_S", 1.0)
+    monkeypatch.setattr(Goto, "timeout_s", 0.1)
+    result = run(Case("kinova", "velocity", "random", "sim", 8000, seed=1))
+    assert result["freed"] == result["trips"]["P29"] > 0
+    assert result["ticks"] >= 8000
+    assert not any(result["violations"].values()), result
+    assert result["ended"] == ""
