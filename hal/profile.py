@@ -243,7 +243,7 @@ class Safety(_Strict):
     """Ticks in a row, each late by more than a period, after which the arm is stopped."""
     overrun_s: Positive = 0.020
     """Time beyond a period between two ticks above which the arm is stopped for good."""
-    watchman_s: Positive = 0.050
+    watchman_s: Positive = 0.040
     """Time without a tick of an armed arm's loop after which the watchman takes its drives. Shorter than the drives'
     own watchdogs, or they go off first."""
     proximity_slow: Positive = 0.020

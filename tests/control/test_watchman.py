@@ -44,7 +44,7 @@ class Beat:
 
 @pytest.fixture
 def beat(panda: Robot) -> Beat:
-    assert panda.profile.safety.watchman_s == 0.05
+    assert panda.profile.safety.watchman_s == 0.04
     return Beat(panda)
 
 
@@ -53,13 +53,13 @@ def test_a_loop_that_ticks_is_never_silent(beat: Beat) -> None:
     assert beat.looks(1000, ticking=True) == []
 
 
-def test_a_loop_that_stands_still_is_silent_once_after_50_ms(beat: Beat) -> None:
+def test_a_loop_that_stands_still_is_silent_once_after_40_ms(beat: Beat) -> None:
     beat.link.watch.power = Power.ON
     beat.looks(10, ticking=True)
     # The first look sees that nothing came since the last one, 5 ms ago.
-    assert beat.looks(100, ticking=False) == [10]
+    assert beat.looks(100, ticking=False) == [8]
     beat.looks(1, ticking=True)
-    assert beat.looks(100, ticking=False) == [10]
+    assert beat.looks(100, ticking=False) == [8]
 
 
 @pytest.mark.parametrize("power", [Power.OFF, Power.CHANGING])
@@ -67,7 +67,7 @@ def test_a_loop_that_need_not_tick_may_stand_still(beat: Beat, power: Power) -> 
     beat.link.watch.power = power
     assert beat.looks(100, ticking=False) == []
     beat.link.watch.power = Power.ON
-    assert beat.looks(100, ticking=False) == [11]  # the first look sees that the drives are on
+    assert beat.looks(100, ticking=False) == [9]  # the first look sees that the drives are on
 
 
 def test_a_watchman_that_slept_itself_gives_the_loop_another_chance(beat: Beat) -> None:

@@ -74,8 +74,8 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         live_stop_scenario(
             11,
             "suspended",
-            "the control process is suspended for 50 ms",
-            _send("control", stop, go, wait_s=0.05),
+            "the control process is suspended for 30 ms",
+            _send("control", stop, go, wait_s=0.03),
             stood_still,
         ),
         live_stop_scenario(

@@ -30,7 +30,7 @@ def test_healthy_drives_are_fine(bench):
         (lambda m: setattr(m, "status", 0xE), Level.FAIL, "OVERLOAD"),
         (lambda m: m.registers.update({Register.TIMEOUT: 0}), Level.FAIL, "no watchdog"),
         (lambda m: m.registers.update({Register.TIMEOUT: 8000}), Level.FAIL, "400 ms"),
-        (lambda m: m.registers.update({Register.TIMEOUT: 1399}), Level.WARN, "before the watchman"),
+        (lambda m: m.registers.update({Register.TIMEOUT: 1199}), Level.WARN, "before the watchman"),
         (lambda m: m.registers.update({Register.VMAX: 8.0}), Level.FAIL, "ranges"),
         (lambda m: m.registers.update({Register.CTRL_MODE: 2}), Level.WARN, "control mode 2"),
     ],
