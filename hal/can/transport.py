@@ -22,6 +22,7 @@ from typing import NamedTuple
 import can
 
 from robotctl.hal.can.channel import Channel
+from robotctl.hal.can.error_frames import ErrorLog
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError
 
@@ -44,13 +45,6 @@ _READ_ERRORS = (can.CanError, OSError, ValueError, IndexError, struct.error, Ass
 _READ_RETRIES = 8
 _OLDEST_STAMP_S = 0.1
 _LOAD_WINDOW_NS = 500_000_000
-
-# Error classes of SocketCAN (linux/can/error.h), as they stand in the id of an error frame.
-_ERROR_CONTROLLER = 0x004
-_ERROR_BUS_OFF = 0x040
-_ERROR_RESTARTED = 0x100
-_CONTROLLER_PASSIVE = 0x30
-_CONTROLLER_ACTIVE = 0x40
 
 Route = Callable[[bytearray, int], bool]
 """Takes the 8 data bytes and the receive stamp in ns; returns whether the frame was understood."""
@@ -98,8 +92,7 @@ class Transport:
         self.rejected = 0
         """Those of the unexpected that came on an id of ours: of a wrong length, or without sense."""
         self.send_failures = 0
-        self.state = "active"
-        """What the error frames say of the controller: active, passive or bus-off."""
+        self.errors = ErrorLog()
         self.trips: deque[int] = deque(maxlen=4096)
         """Round trips in ns; drives append to it."""
         self._bus = channel.bus
@@ -114,6 +107,11 @@ class Transport:
         self._load = 0.0
         self._load_from = clock.now_ns()
         self._load_frames = 0
+
+    @property
+    def state(self) -> str:
+        """What the error frames say of the controller: active, passive or bus-off; gone once it has vanished."""
+        return self.errors.state
 
     # --- out --------------------------------------------------------------------------------------------------------
 
@@ -190,7 +188,8 @@ class Transport:
                     break
                 continue
             if message.is_error_frame:
-                self._on_error_frame(message.arbitration_id, message.data)
+                self.error_frames += 1
+                self.errors.take(message.arbitration_id, message.data)
                 continue
             self.received += 1
             data = message.data
@@ -238,6 +237,7 @@ class Transport:
             "withheld": self.withheld,
             "send_failures": self.send_failures,
             "load": self._load,
+            "errors": dict(self.errors.kinds),
             "state": self.state,
             "round_trip_us": self.round_trip()._asdict(),
         }
@@ -252,7 +252,7 @@ class Transport:
             self._bus.shutdown()
         except (can.CanError, OSError):
             # An interface that has vanished cannot be closed properly; nothing is left to release.
-            self.state = "gone"
+            self.errors.state = "gone"
 
     def _is_withheld(self, frames: Sequence[tuple[int, bytes]]) -> bool:
         assert self.inspector is not None
@@ -290,18 +290,6 @@ class Transport:
 
     def _gone(self) -> BusError:
         return BusError(self._lost, "check the adapter and that the interface is up, then connect again")
-
-    def _on_error_frame(self, error_class: int, data: bytearray) -> None:
-        self.error_frames += 1
-        if error_class & _ERROR_BUS_OFF:
-            self.state = "bus-off"
-        elif error_class & _ERROR_RESTARTED:
-            self.state = "active"
-        elif error_class & _ERROR_CONTROLLER and len(data) > 1 and self.state != "bus-off":
-            if data[1] & _CONTROLLER_PASSIVE:
-                self.state = "passive"
-            elif data[1] & _CONTROLLER_ACTIVE:
-                self.state = "active"
 
     def _measure_load(self, now: int) -> None:
         elapsed = now - self._load_from

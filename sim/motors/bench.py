@@ -11,6 +11,7 @@ from random import Random
 
 from robotctl.hal.can.damiao.codec import BROADCAST_ID, Offset, decode_register
 from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S, ControlMode
+from robotctl.hal.can.error_frames import GARBLED, UNACKNOWLEDGED, ErrorFrame
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.profile import Drive, RobotProfile
 from robotctl.hal.robot import Robot
@@ -24,13 +25,20 @@ _STEP_S = PHYSICS_STEP_NS * 1e-9
 _WARM_NS = 100_000_000
 """Step of the thermal models."""
 
+_ERRORS = 256
+"""Error frames kept for a bus that does not take them."""
+
+_FD_NOMINAL = 1_000_000
+"""Arbitration rate of a drive that is set to CAN FD, bit/s: the faster one is its data phase's."""
+
 _Handler = Callable[[bytes, int], bytes | None]
 
 
 class Bench:
     """All drives of a robot profile, powered up, in the plant's home pose.
 
-    `replies` fills with what the drives answer; whoever runs the bus takes it from there.
+    `replies` fills with what the drives answer, `errors` with what went wrong on the wire; whoever runs the bus takes
+    it from there.
     """
 
     def __init__(self, robot: Robot, start_ns: int = 0, fd: bool | None = None, seed: int = 0) -> None:
@@ -50,6 +58,8 @@ class Bench:
             raise ConfigError(f"robot {profile.name!r} has no CAN drives to emulate", "use panda or openarm")
         self.plant = Plant(robot, start_ns)
         self.replies: deque[Reply] = deque()
+        self.errors: deque[ErrorFrame] = deque(maxlen=_ERRORS)
+        """What the host's controller would tell of the frames that it sent."""
         self.drives: list[DamiaoDrive] = []
         self.now_ns = start_ns
         self.trouble = Troubles(self, seed)
@@ -83,6 +93,17 @@ class Bench:
         self._refresh()
         self.at(start_ns + _WARM_NS, self._warm)
 
+    @property
+    def nominal(self) -> int:
+        """Nominal bit rate of the host, bit/s."""
+        return self._nominal
+
+    @nominal.setter
+    def nominal(self, bitrate: int) -> None:
+        if bitrate != self._nominal:
+            self._nominal = bitrate
+            self._refresh()
+
     def drive(self, which: str | int) -> DamiaoDrive:
         """Return a drive by its joint's name or by its present id.
 
@@ -108,6 +129,8 @@ class Bench:
 
     def receive(self, arbitration_id: int, data: bytes) -> None:
         """Take a data frame with an 11-bit id that a host has sent. Call `advance` first."""
+        if self._error is not None:
+            self.errors.append(self._error)
         routes = self._routes.get(arbitration_id)
         if routes is None:
             if arbitration_id == BROADCAST_ID:
@@ -168,13 +191,21 @@ class Bench:
                 routes.setdefault(drive.id + Offset.VEL, []).append((drive, drive.on_vel))
                 routes.setdefault(drive.id + Offset.POS_FORCE, []).append((drive, drive.on_pos_force))
         self._routes = routes
+        self._error = self._find_error()
         self._servos = [drive for drive in self.drives if drive.is_servoing]
         self._watch_ns = min((drive.deadline_ns for drive in self.drives), default=FOREVER)
         self._next_ns = min(self._watch_ns, self._events[0][0] if self._events else FOREVER)
 
     def _hears(self, drive: DamiaoDrive) -> bool:
         """Return whether a drive has power and its arbitration phase runs at the bus's bit rate."""
-        return drive.powered and (drive.fd or drive.bitrate == self._nominal)
+        return drive.powered and self._nominal == (_FD_NOMINAL if drive.fd else drive.bitrate)
+
+    def _find_error(self) -> ErrorFrame | None:
+        """Return what happens to every frame of the host: nobody is there, or some hear it at another bit rate."""
+        powered = [drive for drive in self.drives if drive.powered]
+        if not powered:
+            return UNACKNOWLEDGED
+        return None if all(self._hears(drive) for drive in powered) else GARBLED
 
     def _on_register(self, data: bytes) -> None:
         for drive in self.drives:
@@ -230,13 +261,20 @@ class Troubles:
 
     def hears(self, drive: DamiaoDrive) -> bool:
         """Return whether a frame reaches a drive."""
-        return all(trouble.hears(self._random) for trouble in self._of(drive))
+        for trouble in self._of(drive):
+            if not trouble.hears(self._random):
+                if trouble.garbles:
+                    self._bench.errors.append(GARBLED)
+                return False
+        return True
 
     def alter(self, drive: DamiaoDrive, reply: Reply) -> list[Reply]:
         """Return what becomes of a reply."""
         replies = [reply]
         for trouble in self._of(drive):
-            replies = list(trouble.alter(replies, self._random))
+            before, replies = len(replies), list(trouble.alter(replies, self._random))
+            if trouble.garbles and len(replies) < before:
+                self._bench.errors.append(GARBLED)
         return replies
 
     def _begin(self, trouble: Trouble) -> None:

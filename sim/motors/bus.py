@@ -33,6 +33,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         self._advance = bench.advance
         self._receive = bench.receive
         self._replies = bench.replies
+        self._wire_errors = bench.errors
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Hand a frame to the drives. Never waits.
@@ -70,6 +71,9 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
 
     def _pop(self) -> can.Message | None:
         if self._errors:
+            return self._errors.popleft()
+        if self._wire_errors:
+            self.report(*self._wire_errors.popleft())
             return self._errors.popleft()
         replies = self._replies
         while replies:

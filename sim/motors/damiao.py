@@ -107,6 +107,10 @@ class DamiaoDrive:
         return Ranges(self.memory[Register.PMAX], self.memory[Register.VMAX], self.memory[Register.TMAX])
 
     @property
+    def _starved(self) -> bool:
+        return self.memory[Register.VBUS] < self.memory[Register.UV_VALUE]
+
+    @property
     def is_servoing(self) -> bool:
         """Whether `step` has to be called as time passes: a position or speed loop of the drive's own is at work."""
         return self._servo is not None
@@ -141,6 +145,17 @@ class DamiaoDrive:
     def fail(self, status: int) -> None:
         """Report a fault from now on; it takes the drive out of enable mode and stays until it is cleared."""
         self._leave(status)
+
+    def supply(self, voltage: float) -> None:
+        """Measure this at the supply, V; below register 0 it switches itself off, and cannot be cleared."""
+        self.memory.write(Register.VBUS, voltage)
+        if self._starved:
+            self.fail(Status.UNDER_VOLTAGE)
+
+    def shift_zero(self, offset: float) -> None:
+        """Report angles that are larger by `offset`, rad, as if its zero had been set elsewhere."""
+        self._zero -= offset
+        self._adopt()
 
     def expire(self) -> None:
         """Let the watchdog bite."""
@@ -272,7 +287,7 @@ class DamiaoDrive:
                     self._leave(Status.DISABLED)
             case Special.CLEAR_ERROR:
                 if not self.enabled:
-                    self._leave(Status.DISABLED)
+                    self._leave(Status.UNDER_VOLTAGE if self._starved else Status.DISABLED)
             case Special.SET_ZERO:
                 self._zero = self.shaft.state()[0]
                 self._turns = 0.0

@@ -12,6 +12,9 @@ from robotctl.hal.can.damiao.registers import (
     encode_value,
 )
 
+NOMINAL_VOLTAGE = 24.0
+"""Supply of a drive, V."""
+
 FLASH_CYCLES = 10_000
 """Writes the vendor promises."""
 
@@ -32,7 +35,8 @@ def factory_values(
     values = dict.fromkeys(REGISTERS, 0.0)
     values |= {0: 15.0, 1: 0.945, 2: 100.0, 3: 0.98, 4: 50.0, 5: -50.0, 6: vmax, 11: 1e-4, 12: 4e-5, 16: 14, 17: 0.65}
     values |= {18: 3e-4, 19: 4.5e-3, 20: 10.0, 24: 1000.0, 25: 4e-3, 26: 2e-3, 27: 50.0, 28: 0.1, 29: 32.0, 30: 1.0}
-    values |= {31: 4.0, 32: 1000.0, 33: 1.0, 34: 2e-3, 54: 0.0, 55: 1.0, 59: 10.26, 60: 24.0}
+    values |= {31: 4.0, 32: 1000.0, 33: 1.0, 34: 2e-3, 54: 0.0, 55: 1.0, 59: 10.26}
+    values |= {Register.VBUS: NOMINAL_VOLTAGE}
     return values | {
         Register.MST_ID: reply_id,
         Register.ESC_ID: motor_id,

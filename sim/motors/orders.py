@@ -5,6 +5,7 @@ from collections.abc import Callable
 from robotctl.hal.can.damiao.registers import REGISTERS
 from robotctl.hal.errors import ConfigError
 from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.damiao import DamiaoDrive
 from robotctl.sim.motors.memory import accepts
 from robotctl.sim.motors.trouble import (
     Corrupt,
@@ -18,6 +19,9 @@ from robotctl.sim.motors.trouble import (
     Runaway,
     Stuck,
     Trouble,
+    UnderVoltage,
+    Unterminated,
+    WrongZero,
 )
 
 _KINDS: dict[str, tuple[type[Trouble], str, Callable[[str], float]]] = {
@@ -25,19 +29,23 @@ _KINDS: dict[str, tuple[type[Trouble], str, Callable[[str], float]]] = {
     "deaf": (Deaf, "", float),
     "drop": (Drop, "probability", float),
     "delay": (Delay, "delay_s", float),
+    "unterminated": (Unterminated, "probability", float),
     "duplicate": (Duplicate, "probability", float),
     "corrupt": (Corrupt, "probability", float),
     "stuck": (Stuck, "", float),
     "runaway": (Runaway, "torque", float),
     "powercut": (PowerCut, "", float),
+    "undervoltage": (UnderVoltage, "voltage", float),
+    "zero": (WrongZero, "offset", float),
     "fault": (Failure, "status", lambda text: int(text, 0)),
 }
 """Class, the field that VALUE sets, and how VALUE is read."""
 
 TROUBLE_FORM = (
     "KIND:MOTOR[:VALUE][@FROM[-UNTIL]], where MOTOR is a joint's name, an id or `all`, and FROM and UNTIL are seconds "
-    f"from the start; KIND is one of {', '.join(_KINDS)}; VALUE is the probability of drop, duplicate and corrupt, the "
-    "seconds of delay, the Nm of runaway, the status code of fault"
+    f"from the start; KIND is one of {', '.join(_KINDS)}; VALUE is the probability of drop, unterminated, duplicate "
+    "and corrupt, the seconds of delay, the Nm of runaway, the volts of undervoltage, the rad of zero, the status code of "
+    "fault"
 )
 REGISTER_FORM = "MOTOR:REGISTER=VALUE, where MOTOR is a joint's name, an id or `all`, and REGISTER a number or a name"
 
@@ -68,7 +76,7 @@ def order_trouble(bench: Bench, order: str) -> None:
     except ValueError as error:
         raise ConfigError(f"trouble {order!r}: {error}", f"write {TROUBLE_FORM}") from error
     for motor in _motors(bench, rest[0]):
-        bench.trouble.add(trouble(motor_id=motor, **values))  # type: ignore[arg-type]
+        bench.trouble.add(trouble(motor_id=motor.id, **values))  # type: ignore[arg-type]
 
 
 def order_register(bench: Bench, order: str) -> None:
@@ -85,18 +93,16 @@ def order_register(bench: Bench, order: str) -> None:
         value = float(int(text, 0)) if register in REGISTERS and REGISTERS[register].integer else float(text)
     except ValueError as error:
         raise ConfigError(f"register {order!r} is not understood: {error}", f"write {REGISTER_FORM}") from error
-    for found in _motors(bench, motor):
+    for drive in _motors(bench, motor):
         if register not in REGISTERS or (REGISTERS[register].writable and not accepts(register, value)):
             raise ConfigError(f"register {order!r}: no drive has that", "see the vendor's list of registers")
-        bench.drive(found).preset(register, value)
+        drive.preset(register, value)
 
 
-def _motors(bench: Bench, word: str) -> list[int]:
+def _motors(bench: Bench, word: str) -> list[DamiaoDrive]:
     if word == "all":
-        return [drive.id for drive in bench.drives]
-    if word in [drive.name for drive in bench.drives]:
-        return [bench.drive(word).id]
+        return list(bench.drives)
     try:
-        return [bench.drive(int(word, 0)).id]
+        return [bench.drive(int(word, 0))]
     except ValueError:
-        return [bench.drive(word).id]
+        return [bench.drive(word)]

@@ -37,6 +37,16 @@ class Port(Protocol):
         ...
 
     @property
+    def bitrate(self) -> int | None:
+        """Nominal bit rate of the hosts, bit/s; None where the channel has none, or does not tell."""
+        ...
+
+    @property
+    def carries_errors(self) -> bool:
+        """Whether hosts can be sent error frames, as their controller would."""
+        ...
+
+    @property
     def garbage(self) -> int:
         """How much came in that was no frame."""
         ...
@@ -60,6 +70,9 @@ class Port(Protocol):
 
 class BusPort:
     """A python-can bus as a port. Nothing that arrives ends it: only an interface that stays broken does."""
+
+    bitrate = None
+    carries_errors = True
 
     def __init__(self, name: str, bus: can.BusABC, fd: bool) -> None:
         self.name = name
@@ -142,7 +155,10 @@ class Server:
             if self.on_frame is not None:
                 frame.timestamp = bench.now_ns * 1e-9
                 self.on_frame(frame)
+            if self._port.bitrate is not None:
+                bench.nominal = self._port.bitrate
             bench.receive(frame.arbitration_id, frame.data)
+        self._report_errors()
         replies = bench.replies
         while replies:
             arbitration_id, data, fd, stamp_ns = replies.popleft()
@@ -163,6 +179,14 @@ class Server:
                 self.answered += 1
         if self.on_status is not None:
             self._watch(self.on_status)
+
+    def _report_errors(self) -> None:
+        """Tell the hosts what their controllers would have seen, where the channel carries it."""
+        errors = self._bench.errors
+        while errors:
+            error = errors.popleft()
+            if self._port.carries_errors:
+                self._port.send(can.Message(arbitration_id=error.error_class, is_error_frame=True, data=error.data))
 
     def _watch(self, report: Callable[[DamiaoDrive, int, float], None]) -> None:
         for index, drive in enumerate(self._bench.drives):

@@ -26,14 +26,18 @@ _TIMER_PERIOD_MS = 60_000
 
 
 class SlcanAdapter:
-    """An adapter on a bus whose nominal bit rate is `bitrate`. At another rate it hears and says nothing."""
+    """An adapter on a bus whose nominal bit rate is `bus_bitrate`. At another rate it hears and says nothing.
 
-    def __init__(self, bitrate: int = 1_000_000) -> None:
+    None leaves it to whoever runs the bus to see who understands whom.
+    """
+
+    def __init__(self, bus_bitrate: int | None = 1_000_000) -> None:
         self.is_open = False
         self.fd = False
         """Whether the host has set a data rate: without one, CAN FD frames do not pass."""
-        self._bus_bitrate = bitrate
-        self._bitrate = bitrate
+        self.bitrate = bus_bitrate or 1_000_000
+        """What the host has set, bit/s."""
+        self._bus_bitrate = bus_bitrate
         self._listen_only = False
         self._stamps = False
         self._buffer = bytearray()
@@ -68,12 +72,7 @@ class SlcanAdapter:
 
     def encode(self, frame: can.Message) -> bytes:
         """Return what the host is told of a frame on the bus; nothing if the adapter cannot receive it."""
-        if (
-            not self.is_open
-            or self._bitrate != self._bus_bitrate
-            or frame.is_error_frame
-            or (frame.is_fd and not self.fd)
-        ):
+        if not self.is_open or not self._understood or frame.is_error_frame or (frame.is_fd and not self.fd):
             return b""
         if frame.is_remote_frame:
             letter = "r"
@@ -89,6 +88,10 @@ class SlcanAdapter:
         data = "" if frame.is_remote_frame else frame.data.hex().upper()
         stamp = f"{int(frame.timestamp * 1e3) % _TIMER_PERIOD_MS:04X}" if self._stamps else ""
         return f"{head}{dlc:X}{data}{stamp}\r".encode()
+
+    @property
+    def _understood(self) -> bool:
+        return self._bus_bitrate in (None, self.bitrate)
 
     def _command(self, line: bytes) -> tuple[bytes, can.Message | None]:
         """Return the answer to one command, and the frame that it sends."""
@@ -122,10 +125,10 @@ class SlcanAdapter:
         """Return the answer to a command that is allowed while the channel is closed."""
         match letter:
             case b"S":
-                self._bitrate = _BITRATES[int(line[1:])]
+                self.bitrate = _BITRATES[int(line[1:])]
                 self.fd = False
             case b"s":
-                self._bitrate = _from_registers(int(line[1:3], 16), int(line[3:5], 16))
+                self.bitrate = _from_registers(int(line[1:3], 16), int(line[3:5], 16))
                 self.fd = False
             case b"Y":
                 if line not in _DATA_RATES:
@@ -158,7 +161,7 @@ class SlcanAdapter:
         if len(data) != length or len(line) != 2 + digits + 2 * length:
             return REFUSED, None
         answer = b"Z\r" if extended else b"z\r"
-        if self._bitrate != self._bus_bitrate:
+        if not self._understood:
             # Nobody understands it, so nobody acknowledges; the adapter has taken it all the same.
             return answer, None
         frame = can.Message(

@@ -20,16 +20,20 @@ _BACKLOG = 1 << 16
 class SlcanPort:
     """Adapters side by side on one bus: what the host of one sends, the drives and the hosts of the others receive."""
 
+    carries_errors = False
+
     def __init__(self, count: int = 1, bitrate: int = 1_000_000) -> None:
-        """Open `count` pseudo-terminals.
+        """Open `count` pseudo-terminals, set to `bitrate` until a host sets another.
 
         Raises:
             BusError: if there are none to be had.
         """
+        self.bitrate: int | None = bitrate
+        """Of the latest frame from a host: adapters at another neither hear it nor what answers it."""
         self._terminals: dict[int, _Terminal] = {}
         self._poll = select.poll()
         for _ in range(count):
-            terminal = _Terminal(bitrate)
+            terminal = _Terminal()
             self._terminals[terminal.descriptor] = terminal
             self._poll.register(terminal.descriptor, select.POLLIN)
 
@@ -60,6 +64,7 @@ class SlcanPort:
             if events & select.POLLIN:
                 awake = True
                 for frame in terminal.read():
+                    self.bitrate = terminal.adapter.bitrate
                     self._deliver(frame, terminal)
                     frames.append(frame)
             else:
@@ -87,13 +92,14 @@ class SlcanPort:
         """Hand a frame to every adapter but the sender's; return whether all that are open could take it."""
         taken = True
         for terminal in self._terminals.values():
-            if terminal is not sender and terminal.adapter.is_open:
-                taken &= terminal.write(terminal.adapter.encode(frame))
+            adapter = terminal.adapter
+            if terminal is not sender and adapter.is_open and adapter.bitrate == self.bitrate:
+                taken &= terminal.write(adapter.encode(frame))
         return taken
 
 
 class _Terminal:
-    def __init__(self, bitrate: int) -> None:
+    def __init__(self) -> None:
         try:
             self.descriptor, host = pty.openpty()
         except OSError as error:
@@ -103,7 +109,7 @@ class _Terminal:
         self.path = os.ttyname(host)
         os.close(host)
         os.set_blocking(self.descriptor, False)
-        self.adapter = SlcanAdapter(bitrate)
+        self.adapter = SlcanAdapter(None)
         self.refused = 0
         self.is_hung_up = False
         self._backlog = bytearray()

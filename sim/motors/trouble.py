@@ -8,6 +8,7 @@ from typing import NamedTuple
 from robotctl.hal.can.damiao.codec import Status, decode_feedback, encode_feedback, is_feedback
 from robotctl.hal.can.damiao.motors import Ranges
 from robotctl.sim.motors.damiao import FOREVER, DamiaoDrive
+from robotctl.sim.motors.memory import NOMINAL_VOLTAGE
 
 
 class Reply(NamedTuple):
@@ -28,6 +29,11 @@ class Trouble:
     """ESC_ID; None for every motor."""
     from_ns: int = 0
     until_ns: int = FOREVER
+
+    @property
+    def garbles(self) -> bool:
+        """Whether frames that it swallows are broken on the wire, so that the host's controller reports them."""
+        return False
 
     def begin(self, drive: DamiaoDrive) -> None:
         """Act on a drive when the time comes."""
@@ -71,6 +77,17 @@ class Drop(Trouble):
 
     def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
         return [reply for reply in replies if random.random() >= self.probability]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unterminated(Drop):
+    """A bus without its resistors: reflections break frames in both directions, and the controllers notice."""
+
+    probability: float = 0.3
+
+    @property
+    def garbles(self) -> bool:
+        return True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +174,33 @@ class Failure(Trouble):
 
     def begin(self, drive: DamiaoDrive) -> None:
         drive.fail(self.status)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnderVoltage(Trouble):
+    """The supply sags: the drive measures so little that it switches itself off, and clearing does not help."""
+
+    voltage: float = 11.0
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        drive.supply(self.voltage)
+
+    def end(self, drive: DamiaoDrive) -> None:
+        drive.supply(NOMINAL_VOLTAGE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrongZero(Trouble):
+    """The zero in its flash is not the joint's: it was set elsewhere, or the motor was taken off and put back."""
+
+    offset: float = 1.0
+    """By how much it reports too much, rad of the motor."""
+
+    def begin(self, drive: DamiaoDrive) -> None:
+        drive.shift_zero(self.offset)
+
+    def end(self, drive: DamiaoDrive) -> None:
+        drive.shift_zero(-self.offset)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 class Register(IntEnum):
     """Registers that this package uses by name; the whole map is `REGISTERS`."""
 
+    UV_VALUE = 0
     MST_ID = 7
     ESC_ID = 8
     TIMEOUT = 9
@@ -20,6 +21,7 @@ class Register(IntEnum):
     TMAX = 23
     CAN_BR = 35
     SUB_VER = 36
+    VBUS = 60
     P_M = 80
     XOUT = 81
 

@@ -95,6 +95,8 @@ class Stub:
 
     name = "stub"
     garbage = 0
+    bitrate = None
+    carries_errors = False
 
     def __init__(self, fd: bool = True) -> None:
         self.fd = fd

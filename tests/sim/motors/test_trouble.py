@@ -15,6 +15,7 @@ from robotctl.hal.can.damiao.codec import (
     encode_special,
 )
 from robotctl.hal.can.damiao.registers import Register
+from robotctl.hal.can.error_frames import GARBLED, UNACKNOWLEDGED
 from robotctl.hal.clock import VirtualClock
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
@@ -34,7 +35,10 @@ from robotctl.sim.motors.trouble import (
     Runaway,
     Short,
     Stuck,
+    UnderVoltage,
+    Unterminated,
     Weak,
+    WrongZero,
 )
 
 MS = 1_000_000
@@ -47,11 +51,14 @@ class Desk:
         self.bench = Bench(robot, seed=seed)
         self.bus = EmulatedBus(self.bench, self.clock)
         self.drive = self.bench.drive(MOTOR)
+        self.errors: list[int] = []
 
     def ask(self, data: bytes = b"", identifier: int = MOTOR) -> list[can.Message]:
         self.clock.sleep_until(self.clock.now_ns() + MS)
         self.bus.send(can.Message(arbitration_id=identifier, is_extended_id=False, data=data or bytes(8)))
-        return list(iter(lambda: self.bus.recv(0.0), None))
+        frames = list(iter(lambda: self.bus.recv(0.0), None))
+        self.errors += [frame.arbitration_id for frame in frames if frame.is_error_frame]
+        return [frame for frame in frames if not frame.is_error_frame]
 
     def status(self) -> int:
         request = encode_register(MOTOR, RegisterCommand.REFRESH)
@@ -175,6 +182,49 @@ def test_power_cut(desk: Desk) -> None:
     assert answered.count(False) == 10
     assert desk.status() == Status.DISABLED
     assert desk.drive.memory[Register.TIMEOUT] == 1600
+
+
+def test_a_bus_without_power_acknowledges_nothing(desk: Desk) -> None:
+    desk.ask()
+    assert desk.errors == []
+    desk.bench.trouble.add(PowerCut())
+    assert desk.ask() == []
+    assert desk.errors == [UNACKNOWLEDGED.error_class]
+
+
+def test_a_drive_at_another_bit_rate_breaks_frames_on_the_wire(desk: Desk) -> None:
+    desk.drive.preset(Register.CAN_BR, 3)
+    assert desk.ask() == []
+    assert desk.errors == [GARBLED.error_class]
+    desk.bench.nominal = 500_000
+    assert len(desk.ask()) == 1
+
+
+def test_without_termination_frames_are_lost_and_the_controller_says_so(desk: Desk) -> None:
+    desk.bench.trouble.add(Unterminated(probability=0.3))
+    lost = [not desk.ask() for _ in range(300)].count(True)
+    assert 110 < lost < 200  # half of them: 0.7 times 0.7 get through
+    assert desk.errors == [GARBLED.error_class] * lost
+
+
+def test_under_voltage_cannot_be_cleared_until_the_supply_is_back(desk: Desk) -> None:
+    sag = UnderVoltage(motor_id=MOTOR, voltage=11.0)
+    desk.bench.trouble.add(sag)
+    desk.ask(encode_special(Special.CLEAR_ERROR))
+    assert desk.status() == Status.UNDER_VOLTAGE
+    desk.bench.trouble.remove(sag)
+    desk.ask(encode_special(Special.CLEAR_ERROR))
+    assert desk.status() == Status.DISABLED
+
+
+def test_a_wrong_zero_shifts_what_is_reported_and_not_the_shaft(desk: Desk) -> None:
+    def reported() -> float:
+        return decode_feedback(desk.ask()[0].data, desk.drive.ranges).position
+
+    before, shaft = reported(), desk.drive.shaft.state()[0]
+    desk.bench.trouble.add(WrongZero(motor_id=MOTOR, offset=0.5))
+    assert reported() - before == pytest.approx(0.5, abs=5e-3)
+    assert desk.drive.shaft.state()[0] == pytest.approx(shaft, abs=5e-3)
 
 
 def test_failure(desk: Desk) -> None:
