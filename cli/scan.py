@@ -11,60 +11,73 @@ from rich.console import Console
 from rich.table import Table
 
 from robotctl.cli.errors import Exit, readable_errors
+from robotctl.cli.findings import print_findings
 from robotctl.cli.output import write_json
-from robotctl.hal.can.channel import open_channel
 from robotctl.hal.can.damiao.registers import ControlMode
-from robotctl.hal.can.scan import LAST_ID, FoundMotor, Scan
-from robotctl.hal.can.scan import scan as scan_channel
+from robotctl.hal.can.found import FoundMotor
+from robotctl.hal.can.scan import LAST_ID, Scan, sweep
 from robotctl.hal.clock import MonotonicClock
+from robotctl.hal.host import Level
 from robotctl.hal.robot import load_robot
 
 
 def scan(
     channel: Annotated[str, typer.Option(help="emulated, virtual:NAME, socketcan:can0, slcan:DEVICE.")] = "emulated",
-    robot: Annotated[str, typer.Option(help="Robot whose wiring (CAN FD, bit rates) is used.")] = "panda",
+    robot: Annotated[str, typer.Option(help="Robot whose wiring (CAN FD, bit rates) is tried first.")] = "panda",
     last: Annotated[int, typer.Option(min=1, max=0x7F, help="Ask the ids 1 to this.")] = LAST_ID,
+    thorough: Annotated[
+        bool, typer.Option("--thorough", help="Try every bit rate, even if somebody answers. Not on a bus in use.")
+    ] = False,
     json: Annotated[Path | None, typer.Option(help="Write what was found here.")] = None,
 ) -> None:
-    """Find the drives on a CAN bus. Only reads; exit status 4 if nobody answers."""
+    """Find the drives on a CAN bus, and say why nobody answers. Only reads; exit status 4 if nobody does."""
     console = Console(highlight=False)
     with readable_errors():
-        clock = MonotonicClock()
-        opened = open_channel(channel, load_robot(robot), clock)
-        try:
-            found = scan_channel(opened, clock, last)
-        finally:
-            opened.bus.shutdown()
-        if found.motors:
-            console.print(motor_table(found, channel))
-        for hint in found.hints:
-            console.print(f"- {hint}", markup=False)
+        found = sweep(channel, load_robot(robot), MonotonicClock(), last, thorough=thorough)
+        for attempt in found.attempts:
+            if attempt.motors:
+                console.print(_table(attempt.motors, f"drives on {channel}, {attempt.way}"))
+        print_findings(console, [finding for finding in found.findings if _is_news(found, finding.level)])
         if json is not None:
-            write_json(json, scan_report(found, channel))
+            write_json(json, _report(found, channel))
     if not found.motors:
         raise typer.Exit(Exit.NO_HARDWARE)
 
 
-def motor_table(found: Scan, channel: str) -> Table:
-    """Return what a scan found, one row per motor."""
-    table = Table(title=f"drives on {channel}", box=box.SIMPLE_HEAD, padding=0)
+def _is_news(found: Scan, level: Level) -> bool:
+    """Return whether a finding is worth a line: what a channel cannot show matters only where something is wrong."""
+    return level is not Level.OK or any(finding.level is not Level.OK for finding in found.findings)
+
+
+def _table(motors: tuple[FoundMotor, ...], title: str) -> Table:
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=0)
     for heading in ("id", "reply", "motor", "sw", "mode", "watchdog\nms", "angle\nrad", "temp.\n°C", "status"):
         table.add_column(heading, overflow="fold")
-    for motor in found.motors:
+    for motor in motors:
         table.add_row(*_row(motor))
     return table
 
 
-def scan_report(found: Scan, channel: str) -> dict[str, Any]:
-    """Return a scan as JSON-ready data. Units: rad, s, degrees Celsius, bit/s; unknown values are null."""
-    motors = []
-    for motor in found.motors:
-        entry = dataclasses.asdict(motor)
-        entry["identity"] = motor.identity and {**motor.identity._asdict(), "ranges": motor.identity.ranges._asdict()}
-        entry["models"] = list(motor.models)
-        entry["position"] = None if math.isnan(motor.position) else motor.position
-        motors.append(entry)
-    return {"channel": channel, "motors": motors, "hints": list(found.hints), "statistics": found.statistics}
+def _report(found: Scan, channel: str) -> dict[str, Any]:
+    """Return a scan as JSON-ready data. Units: rad, s, V, degrees Celsius, bit/s; unknown values are null."""
+    return {
+        "channel": channel,
+        "motors": [_entry(motor) for motor in found.motors],
+        "findings": [finding._asdict() for finding in found.findings],
+        "attempts": [
+            {**attempt.way._asdict(), "motors": [_entry(motor) for motor in attempt.motors], "errors": attempt.errors}
+            for attempt in found.attempts
+        ],
+        "statistics": found.statistics,
+    }
+
+
+def _entry(motor: FoundMotor) -> dict[str, Any]:
+    entry = dataclasses.asdict(motor)
+    entry["identity"] = motor.identity and {**motor.identity._asdict(), "ranges": motor.identity.ranges._asdict()}
+    entry["models"] = list(motor.models)
+    entry["position"] = None if math.isnan(motor.position) else motor.position
+    return entry
 
 
 def _row(motor: FoundMotor) -> tuple[str, ...]:

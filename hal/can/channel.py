@@ -24,6 +24,7 @@ from robotctl.hal.types import Truth
 
 FORMS = "emulated, virtual:NAME, socketcan:INTERFACE, slcan:DEVICE, or INTERFACE:CHANNEL for any other of python-can's"
 
+_CLOSE_TRIES = 3
 SLCAN_SETTLE_S = 0.1
 """Wait after a serial port was opened. python-can waits 2 s, for adapters that reboot when opened; USB ones do not."""
 
@@ -42,6 +43,19 @@ class Channel:
     """The true state of the plant behind it, where that is known."""
     simulated: bool = False
     """Whether its time is the clock's that it was opened with, and nothing arrives unless that clock moves."""
+
+    def close(self) -> bool:
+        """Shut the bus down, and return whether that went well; an interface that has vanished cannot be closed.
+
+        A serial port refuses its last bytes while its queue is full, which passes.
+        """
+        for _ in range(_CLOSE_TRIES):
+            try:
+                self.bus.shutdown()
+            except (can.CanError, OSError):
+                continue
+            return True
+        return False
 
 
 ChannelFactory = Callable[[Robot, Clock], Channel]
@@ -111,7 +125,17 @@ def _open(name: str, robot: Robot, clock: Clock, settle_s: float) -> Channel:
             f"unknown channel {name!r}: python-can has no interface {interface!r}",
             f"use {FORMS}: {', '.join(sorted(can.VALID_INTERFACES))}",
         )
-    bus = open_bus(interface, where, options(interface, wiring, settle_s))
+    return open_wired(name, wiring, options(interface, wiring, settle_s))
+
+
+def open_wired(name: str, wiring: CanBus, options: Mapping[str, Any]) -> Channel:
+    """Open one of python-can's channels with options of the caller's, such as those of `options`.
+
+    Raises:
+        BusError: if it cannot be opened.
+    """
+    interface, _, where = name.partition(":")
+    bus = open_bus(interface, where, options)
     return Channel(bus, fd=wiring.fd and bus.protocol is not can.CanProtocol.CAN_20)
 
 

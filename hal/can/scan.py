@@ -1,160 +1,93 @@
-"""Who is on the bus? Register reads and feedback requests only: nothing is enabled, cleared or written.
+"""Who is on the bus, and if nobody is, why? Every protocol's probe is asked; none of them enables, clears or writes."""
 
-A drive is asked by its id and answers on whatever reply id it has, so every answer is looked at, wherever it comes.
-"""
-
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from robotctl.hal.can.channel import Channel
-from robotctl.hal.can.damiao.codec import BROADCAST_ID, RegisterCommand, decode_register, encode_register
-from robotctl.hal.can.damiao.drive import Drive, Identity
-from robotctl.hal.can.damiao.faults import status_name
-from robotctl.hal.can.damiao.motors import MOTORS, Ranges
-from robotctl.hal.can.damiao.registers import CAN_BITRATES, ControlMode, Register
+from robotctl.hal.can.channel import Channel, open_channel
+from robotctl.hal.can.damiao.probe import probe
+from robotctl.hal.can.found import FoundMotor
 from robotctl.hal.can.transport import Transport
+from robotctl.hal.can.verdict import Attempt, bus_findings
+from robotctl.hal.can.ways import Way, blind_spots, open_way, other_ways, own_way
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import DriveError
+from robotctl.hal.errors import BusError, ConfigError
+from robotctl.hal.host import Finding
+from robotctl.hal.robot import Robot
 
 LAST_ID = 32
 
-_ROUNDS = 3
-"""Each id is asked this often; single replies get lost."""
-_BATCH = 4
-"""Requests in flight, fewer than the 10 frames of the kernel's default transmit queue."""
-_BATCH_WAIT_S = 0.005
-_NOMINAL = Ranges(12.5, 45.0, 54.0)
-"""Only until the drive's own are read."""
+Probe = Callable[[Transport, Clock, int], tuple[FoundMotor, ...]]
+"""Asks the ids 1 to a last one, and returns who answered. It may read, and nothing else."""
 
-
-@dataclass(frozen=True, slots=True)
-class FoundMotor:
-    """A drive that answered."""
-
-    id: int
-    reply_ids: tuple[int, ...]
-    """More than one: several motors share the id."""
-    identity: Identity | None = None
-    """None if it answered once and then no more."""
-    bitrate: int = 0
-    """bit/s, 0 if unknown. Above 1 Mbit/s it answers in CAN FD."""
-    position: float = float("nan")
-    """Motor angle, rad."""
-    mosfet_temperature: int = 0
-    """degrees Celsius"""
-    rotor_temperature: int = 0
-    """degrees Celsius"""
-    status: str = ""
-
-    @property
-    def models(self) -> tuple[str, ...]:
-        """Motors of the table with these ranges: a guess, since the drive does not tell."""
-        return guess_models(self.identity.ranges) if self.identity else ()
+PROBES: dict[str, Probe] = {"damiao": probe}
+"""By protocol, as in a profile's `can.protocol`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """What a scan found, and what to try where it found too little."""
+    """What a scan found, and what is wrong with the bus as far as that can be seen."""
 
     motors: tuple[FoundMotor, ...]
-    hints: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     statistics: dict[str, object] = field(default_factory=dict)
+    attempts: tuple[Attempt, ...] = ()
 
 
-def scan(channel: Channel, clock: Clock, last_id: int = LAST_ID) -> Scan:
-    """Ask the ids 1 to `last_id` who they are. Takes about 0.2 s, and 0.1 s more for every drive that drops out.
-
-    The channel stays open.
+def scan(channel: Channel, clock: Clock, last_id: int = LAST_ID, way: Way | None = None) -> Attempt:
+    """Ask the ids 1 to `last_id` on an open channel, which stays open.
 
     Raises:
         BusError: if the bus is gone.
     """
-    transport = Transport(channel, clock)
-    answers = _probe(transport, range(1, last_id + 1))
-    motors = tuple(_examine(transport, clock, motor, replies) for motor, replies in sorted(answers.items()))
-    return Scan(motors, _hints(motors, transport, last_id), transport.statistics())
-
-
-def guess_models(ranges: Ranges) -> tuple[str, ...]:
-    """Return the models whose full-scale ranges are these."""
-    return tuple(
-        name
-        for name, table in MOTORS.items()
-        if all(abs(a - b) <= 1e-3 * b for a, b in zip(ranges, table, strict=True))
-    )
-
-
-def _probe(transport: Transport, ids: Sequence[int]) -> dict[int, Counter[int]]:
-    """Return how often each motor id answered on which reply id."""
-    answers: dict[int, Counter[int]] = {}
-
-    def listen(arbitration_id: int, data: bytes) -> None:
-        # Our own requests, looped back, come on the broadcast id.
-        if arbitration_id == BROADCAST_ID or len(data) != 8:
-            return
-        motor = data[0] | data[1] << 8
-        frame = decode_register(data, motor)
-        if motor in ids and frame and (frame.command, frame.register) == (RegisterCommand.READ, Register.SN):
-            answers.setdefault(motor, Counter())[arbitration_id] += 1
-
-    transport.listener = listen
-    for _ in range(_ROUNDS):
-        for start in range(0, len(ids), _BATCH):
-            for motor in ids[start : start + _BATCH]:
-                transport.send(BROADCAST_ID, encode_register(motor, RegisterCommand.READ, Register.SN))
-            transport.wait(lambda: False, _BATCH_WAIT_S)
-    transport.listener = None
-    return answers
-
-
-def _examine(transport: Transport, clock: Clock, motor: int, replies: Counter[int]) -> FoundMotor:
-    reply_ids = tuple(sorted(replies))
-    if max(replies.values()) > _ROUNDS:
-        reply_ids = tuple(sorted(replies.elements()))[::_ROUNDS]
-    drive = Drive(f"motor {motor}", motor, reply_ids[0], _NOMINAL, transport, clock)
+    way = way or Way(1_000_000, channel.fd)
+    transport = Transport(channel, clock, way.bitrate)
+    motors: list[FoundMotor] = []
+    failure = ""
     try:
-        identity = drive.identify()
-        code = int(drive.read_register(Register.CAN_BR))
-        drive.adopt(identity.ranges)
-        drive.refresh()
-    except DriveError:
-        return FoundMotor(motor, reply_ids)
-    return FoundMotor(
-        motor,
-        reply_ids,
-        identity,
-        CAN_BITRATES[code] if code < len(CAN_BITRATES) else 0,
-        drive.position,
-        drive.mosfet_temperature,
-        drive.rotor_temperature,
-        status_name(drive.status),
-    )
+        for ask in PROBES.values():
+            motors += ask(transport, clock, last_id)
+    except BusError as error:
+        if not transport.errors.kinds and not transport.send_failures:
+            raise
+        failure = error.what  # nobody acknowledges: that is a finding, too
+    trips = transport.round_trip() if transport.trips else None
+    errors = dict(transport.errors.kinds)
+    return Attempt(way, tuple(motors), transport.statistics(), errors, last_id, failure, trips)
 
 
-def _hints(motors: Sequence[FoundMotor], transport: Transport, last_id: int) -> tuple[str, ...]:
-    hints = []
-    if not motors:
-        wire = "CAN FD" if transport.fd else "classic CAN"
-        hints += [
-            f"nothing answered on the ids 1 to {last_id}: are the drives powered, and is the e-stop released?",
-            "termination: 60 Ohm between CAN_H and CAN_L with the power off, 120 Ohm at each end; common ground",
-            f"bit rates: the host speaks {wire}; a drive set above 1 Mbit/s answers in CAN FD only, one at or below "
-            "1 Mbit/s in classic CAN",
-        ]
-        if transport.error_frames:
-            hints.append(f"{transport.error_frames} error frames: most likely a wrong bit rate, or nobody acknowledges")
-        if transport.send_failures:
-            hints.append(f"{transport.send_failures} frames could not be sent: nobody acknowledges them")
-    for motor in motors:
-        who = f"id 0x{motor.id:02X}"
-        if len(motor.reply_ids) > 1:
-            listed = ", ".join(f"0x{reply:02X}" for reply in motor.reply_ids)
-            hints.append(f"{who}: {len(motor.reply_ids)} motors share it (replies on {listed}); unplug all but one")
-        if motor.identity is None:
-            hints.append(f"{who}: answered once and then no more; a loose contact, or a second motor with its id")
-        elif motor.identity.timeout_s == 0.0:
-            hints.append(f"{who}: its watchdog is off; set register 9 (TIMEOUT, 50 us a count), e.g. 2000 for 100 ms")
-        if motor.identity and motor.identity.mode not in ControlMode._value2member_map_:
-            hints.append(f"{who}: unknown control mode {motor.identity.mode}")
-    return tuple(hints)
+def sweep(
+    name: str, robot: Robot, clock: Clock, last_id: int = LAST_ID, wanted: Collection[int] = (), thorough: bool = False
+) -> Scan:
+    """Scan a channel the way that its robot's profile says, and in other ways where somebody is missing.
+
+    A host at a wrong bit rate disturbs whoever talks on the bus, so the others are tried only if nobody answers, if
+    one of the ids `wanted` does not, or if the search is to be `thorough`. A kernel interface keeps its bit rate.
+
+    Raises:
+        ConfigError: if the channel's name has no known form, or the robot has no CAN drives.
+        BusError: if the channel cannot be opened, or is lost.
+    """
+    wiring = robot.profile.can
+    channel = open_channel(name, robot, clock)
+    if wiring is None:
+        raise ConfigError(f"robot {robot.profile.name!r} has no CAN drives")
+    with _open(channel):
+        attempts = [scan(channel, clock, last_id, own_way(name, wiring))]
+    for way in other_ways(name, wiring):
+        found = {motor.id for attempt in attempts for motor in attempt.motors}
+        if found and found >= set(wanted) and not thorough:
+            break
+        other = open_way(name, wiring, way)
+        with _open(other):
+            attempts.append(scan(other, clock, last_id, way))
+    first = attempts[0]
+    return Scan(first.motors, tuple(bus_findings(attempts, blind_spots(name))), first.statistics, tuple(attempts))
+
+
+@contextmanager
+def _open(channel: Channel) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        channel.close()

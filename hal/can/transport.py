@@ -95,7 +95,7 @@ class Transport:
         self.errors = ErrorLog()
         self.trips: deque[int] = deque(maxlen=4096)
         """Round trips in ns; drives append to it."""
-        self._bus = channel.bus
+        self._channel = channel
         self._recv = channel.bus.recv
         self._send = channel.bus.send
         self._clock = clock
@@ -248,10 +248,7 @@ class Transport:
             return
         self._closed = True
         self._lost = self._lost or "the channel was closed"
-        try:
-            self._bus.shutdown()
-        except (can.CanError, OSError):
-            # An interface that has vanished cannot be closed properly; nothing is left to release.
+        if not self._channel.close():
             self.errors.state = "gone"
 
     def _is_withheld(self, frames: Sequence[tuple[int, bytes]]) -> bool:

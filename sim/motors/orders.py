@@ -44,7 +44,7 @@ _KINDS: dict[str, tuple[type[Trouble], str, Callable[[str], float]]] = {
 TROUBLE_FORM = (
     "KIND:MOTOR[:VALUE][@FROM[-UNTIL]], where MOTOR is a joint's name, an id or `all`, and FROM and UNTIL are seconds "
     f"from the start; KIND is one of {', '.join(_KINDS)}; VALUE is the probability of drop, unterminated, duplicate "
-    "and corrupt, the seconds of delay, the Nm of runaway, the volts of undervoltage, the rad of zero, the status code of "
+    "and corrupt, the seconds of delay, the Nm of runaway, the volts of undervoltage, the rad of zero, the status of "
     "fault"
 )
 REGISTER_FORM = "MOTOR:REGISTER=VALUE, where MOTOR is a joint's name, an id or `all`, and REGISTER a number or a name"

@@ -83,7 +83,7 @@ class Drop(Trouble):
 class Unterminated(Drop):
     """A bus without its resistors: reflections break frames in both directions, and the controllers notice."""
 
-    probability: float = 0.3
+    probability: float = 0.2
 
     @property
     def garbles(self) -> bool:

@@ -229,13 +229,13 @@ class Drive:
 
     # --- requests: bring-up and shutdown, not for the loop ----------------------------------------------------------
 
-    def read_register(self, register: int) -> float:
+    def read_register(self, register: int, tries: int = TRIES) -> float:
         """Return a register's value.
 
         Raises:
-            DriveError: if the drive does not answer, five times in a row.
+            DriveError: if the drive does not answer, `tries` times in a row.
         """
-        for _ in range(TRIES):
+        for _ in range(tries):
             replies = self._request(RegisterCommand.READ, register)
             if replies:
                 return decode_value(register, replies[0])
