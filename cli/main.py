@@ -6,6 +6,7 @@ from robotctl.cli.bench import bench_app
 from robotctl.cli.doctor import doctor
 from robotctl.cli.emulate import emulate
 from robotctl.cli.faults import faults
+from robotctl.cli.motor import motor_app
 from robotctl.cli.run import run
 from robotctl.cli.scan import scan
 from robotctl.cli.stop import stop
@@ -19,6 +20,7 @@ app = typer.Typer(
 for verb in (run, stop, scan, doctor, emulate, faults):
     app.command()(verb)
 app.add_typer(bench_app, name="bench")
+app.add_typer(motor_app, name="motor")
 
 
 def main() -> None:

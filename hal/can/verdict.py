@@ -136,7 +136,7 @@ def _motor(motor: FoundMotor) -> Iterator[Finding]:
         yield Finding("bus", who, Level.FAIL, text, "unplug all but one, and `robotctl motor set-id` each in turn")
     if motor.identity and motor.identity.timeout_s == 0.0:
         text = "its watchdog is off: it would go on when the host dies"
-        yield Finding("bus", who, Level.WARN, text, f"`robotctl motor set-watchdog 100 --id {motor.id}`")
+        yield Finding("bus", who, Level.WARN, text, f"`robotctl motor set-watchdog 0x{motor.id:02X} 100`")
 
 
 def _errors(attempt: Attempt) -> str:
