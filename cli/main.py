@@ -6,6 +6,7 @@ from robotctl.cli.bench import bench_app
 from robotctl.cli.doctor import doctor
 from robotctl.cli.emulate import emulate
 from robotctl.cli.faults import faults
+from robotctl.cli.monitor import monitor
 from robotctl.cli.motor import motor_app
 from robotctl.cli.run import run
 from robotctl.cli.scan import scan
@@ -17,7 +18,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for verb in (run, stop, scan, doctor, emulate, faults):
+for verb in (run, stop, scan, doctor, monitor, emulate, faults):
     app.command()(verb)
 app.add_typer(bench_app, name="bench")
 app.add_typer(motor_app, name="motor")

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from ruamel.yaml import YAML
 
@@ -91,5 +92,4 @@ def write_dump(path: Path, dump: Dump) -> None:
 
 def readable(value: float) -> float | int:
     """Return a number as short as it can be, with everything that 32 bits hold of it."""
-    short = float(f"{value:.9g}")
-    return int(short) if short.is_integer() and abs(short) < 2**53 else short
+    return int(value) if value.is_integer() else float(str(np.float32(value)))
