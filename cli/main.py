@@ -8,6 +8,7 @@ from robotctl.cli.emulate import emulate
 from robotctl.cli.faults import faults
 from robotctl.cli.monitor import monitor
 from robotctl.cli.motor import motor_app
+from robotctl.cli.replay import replay
 from robotctl.cli.run import run
 from robotctl.cli.scan import scan
 from robotctl.cli.stop import stop
@@ -18,7 +19,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for verb in (run, stop, scan, doctor, monitor, emulate, faults):
+for verb in (run, stop, scan, doctor, monitor, replay, emulate, faults):
     app.command()(verb)
 app.add_typer(bench_app, name="bench")
 app.add_typer(motor_app, name="motor")

@@ -1,4 +1,4 @@
-"""The black box: after a trip, everything the ring remembers goes into a file of its own.
+"""The black box: after a trip, everything the rings remember, states and raw frames, goes into a file of its own.
 
 It lives on the operator's side and reads the ring itself, so it needs no recorder and survives the loss of one. The
 ring is copied at once; the file is written by a thread, beside whatever the operator's side does next.
@@ -13,6 +13,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from robotctl.control.frame_ring import FrameRing
 from robotctl.control.recording import Recording
 from robotctl.control.shared import Board, Link, TickRing
 from robotctl.hal.robot import Robot
@@ -35,6 +36,7 @@ class BlackBox:
         stem: path of the files up to `-trip-<n>.mcap`.
         about: what the files should say of themselves.
         offset_ns: of `recording.wall_offset_ns`; by default that of the machine's monotonic clock.
+        frames: the session's ring of raw frames, if it has one.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class BlackBox:
         stem: str | os.PathLike[str],
         about: Mapping[str, object],
         offset_ns: int | None = None,
+        frames: FrameRing | None = None,
     ) -> None:
         self.paths: list[Path] = []
         """Files written so far."""
@@ -54,6 +57,7 @@ class BlackBox:
         self._stem = Path(stem)
         self._about = dict(about)
         self._offset_ns = offset_ns
+        self._frames = frames
         self._lock = threading.Lock()
         self._hurry = threading.Event()
         self._trips: list[dict[str, Any]] = []
@@ -83,9 +87,10 @@ class BlackBox:
         with self._lock:
             trips, self._trips = self._trips, []
             records = snapshot(self._link.ticks)
+            frames = None if self._frames is None else (self._frames.snapshot(), self._frames.description)
             events = self._events()
         try:
-            path = self._write(records, events, trips)
+            path = self._write(records, events, trips, frames)
         except OSError as error:
             self.problems.append(f"no black box of the trip {trips[0].get('text', '')!r}: {error}")
         else:
@@ -109,7 +114,13 @@ class BlackBox:
         self.problems.append("the black box lacks all events but the trip: the ring of events could not be read")
         return []
 
-    def _write(self, records: NDArray[Any], events: list[dict[str, Any]], trips: list[dict[str, Any]]) -> Path:
+    def _write(
+        self,
+        records: NDArray[Any],
+        events: list[dict[str, Any]],
+        trips: list[dict[str, Any]],
+        frames: tuple[NDArray[Any], dict[str, Any]] | None,
+    ) -> Path:
         about = {**self._about, "trip": trips[0].get("text", "")}
         number = 1
         while True:
@@ -121,6 +132,8 @@ class BlackBox:
                 continue
             with recording:
                 recording.take(records, events or trips)
+                if frames is not None:
+                    recording.take_frames(*frames)
             return path
 
 

@@ -8,6 +8,7 @@ It runs in real time in a process of its own (`control.process`) or in lockstep 
 
 from collections.abc import Sequence
 
+from robotctl.control.frame_ring import FrameRing
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.motion import Motion
 from robotctl.control.neighbours import Neighbours
@@ -37,8 +38,16 @@ _MOVING = (State.RUN, State.RESET)
 class Loop:
     """The control of one arm. `link` is where targets and requests come from and ticks and events go to."""
 
-    def __init__(self, robot: Robot, rig: Rig, clock: Clock, link: Link, reset: Sequence[Step] = ()) -> None:
-        """Build everything that a tick needs; `reset` holds the steps of TASK_RESET.
+    def __init__(
+        self,
+        robot: Robot,
+        rig: Rig,
+        clock: Clock,
+        link: Link,
+        reset: Sequence[Step] = (),
+        frames: FrameRing | None = None,
+    ) -> None:
+        """Build everything that a tick needs; `reset` holds the steps of TASK_RESET, `frames` remembers the bus's.
 
         Raises:
             ConfigError: if the robot's model is not that of its profile, or it cannot do one of the steps.
@@ -66,6 +75,9 @@ class Loop:
             robot, rig.arm, self.kinematics, self._motion, self.supervisor, self._powering, link, task_reset
         )
         self._estop = ""
+        self._frames = frames
+        if frames is not None:
+            rig.arm.record_frames(frames)
 
     # -- life -----------------------------------------------------------------------------------------------------
 
@@ -143,6 +155,8 @@ class Loop:
         """From sample to command and record."""
         supervisor, motion = self.supervisor, self._motion
         sample = supervisor.screen(self._arm.read())
+        if self._frames is not None:
+            self._frames.mark(now)
         self._guard.observe(sample, now, self.lateness_ns)
         tool = self.kinematics.tool(sample.position)
         motion.observer.step(sample)

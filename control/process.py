@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from robotctl.control import registry
+from robotctl.control.frame_ring import FrameRing
 from robotctl.control.loop import Loop
 from robotctl.control.operator import Verb
 from robotctl.control.process_tools import go_real_time, leave_real_time, name_process, signal_on_parent_death
@@ -38,6 +39,9 @@ class ProcessConfig:
     mailbox_fd: int
     board_fd: int
     slots: int
+    frames_fd: int | None
+    """Of the ring of raw frames; None for a backend without a bus."""
+    frame_slots: int
     operator: int
     """Pid of the operator's process."""
     limits: str
@@ -62,7 +66,8 @@ def main(text: str) -> int:
         link = Link.attach(config.mailbox_fd, config.board_fd, robot.dof, config.slots)
         clock = MonotonicClock()
         rig = open_backend(config.backend, robot, clock, config.channel)
-        loop = Loop(robot, rig, clock, link, parse(config.reset))
+        frames = None if config.frames_fd is None else FrameRing.attach(config.frames_fd, config.frame_slots)
+        loop = Loop(robot, rig, clock, link, parse(config.reset), frames)
     except RobotctlError as error:
         print(error, file=sys.stderr)  # noqa: T201 - the memory is not mapped yet; the operator reads this
         return 2 if isinstance(error, ConfigError) else 4

@@ -12,10 +12,11 @@ from contextlib import suppress
 from typing import Any
 
 from robotctl.control import registry
+from robotctl.control.frame_ring import FrameRing
 from robotctl.control.operator import Verb
 from robotctl.control.process import ProcessConfig
 from robotctl.control.rehearsal import Rehearsal, rehearse
-from robotctl.control.session import Session, Stopped, history_slots
+from robotctl.control.session import Session, Stopped, frame_slots, history_slots
 from robotctl.control.shared import Link
 from robotctl.control.task_reset import Step, dump
 from robotctl.control.watchman import LONGEST_RESCUE_S, WatchmanConfig
@@ -47,6 +48,8 @@ class ProcessSession(Session):
     ) -> None:
         """Take what the control process will be told; `reset` holds the steps of TASK_RESET."""
         super().__init__(robot, MonotonicClock(), Link.create(robot.dof, history_slots(robot)))
+        if backend == "can":
+            self.frames = FrameRing.create(frame_slots(robot))
         self._backend = backend
         self._channel = channel
         self._overrides = list(overrides)
@@ -89,18 +92,21 @@ class ProcessSession(Session):
             mailbox_fd=mailbox,
             board_fd=board,
             slots=self.link.ticks.slots,
+            frames_fd=None if self.frames is None else self.frames.fd,
+            frame_slots=0 if self.frames is None else self.frames.slots,
             operator=os.getpid(),
             limits=self.robot.limits_text,
             reset=dump(self._reset),
         )
         shared = [mailbox, board]
+        frames = [] if self.frames is None or self.frames.fd is None else [self.frames.fd]
         if is_shared(self._channel):
             # Inherited, so that the channel is taken for as long as any of the three processes lives.
             self._claim = registry.claim(self._channel)
             shared.append(self._claim.fileno())
         self._process = subprocess.Popen(
             [sys.executable, "-m", "robotctl.control.process", config.to_json()],
-            pass_fds=shared,
+            pass_fds=[*shared, *frames],
             stdin=subprocess.DEVNULL,
             stderr=self._complaints,
             start_new_session=True,  # Ctrl-C in the terminal must not reach it
@@ -164,6 +170,9 @@ class ProcessSession(Session):
             for fd in self.link.fds:
                 os.close(fd)
             self.link.fds = None
+        if self.frames is not None and self.frames.fd is not None:
+            os.close(self.frames.fd)
+            self.frames.fd = None
 
     def _start_watchman(self, control: int, shared: list[int]) -> None:
         mailbox, board = self.fds

@@ -11,6 +11,7 @@
 | `/safety`         | JSON                  | supervisor's state, epoch, clip flags and timing of every tick    |
 | `/event`          | JSON                  | every event as the loop wrote it                                  |
 | `/log`            | foxglove.Log          | the events that have a text                                       |
+| `/can/frames`     | robotctl.Frames       | black boxes only: raw frames of the bus, see `frame_ring`         |
 
 Everything is timed in wall clock: the monotonic stamp plus one offset, taken once. `/safety` and `/event` keep the
 monotonic stamp as `stamp_ns`; for the others it is the log time less the metadata's `wall_offset_ns`.
@@ -56,6 +57,11 @@ _SECOND_NS = 1_000_000_000
 
 _LEVELS = {"trip": LogLevel.Error, "page": LogLevel.Error, "error": LogLevel.Fatal, "dropped": LogLevel.Warning}
 """How loud a type of event is in the log; anything else is information."""
+
+
+FRAMES_TOPIC = "/can/frames"
+_FRAMES_SCHEMA = "robotctl.Frames"
+_FRAMES_PER_MESSAGE = 10_000
 
 
 def _schema(title: str, **properties: dict[str, object]) -> dict[str, object]:
@@ -155,6 +161,25 @@ class Recording:
             self._take_ticks(records)
         for event in events:
             self._take_event(event)
+        self._file.check()
+
+    def take_frames(self, slots: NDArray[Any], description: Mapping[str, Any]) -> None:
+        """Write raw frames, and what they are decoded with.
+
+        Args:
+            slots: of `frame_ring.FRAME_DTYPE`, in their order.
+            description: in terms of JSON.
+
+        Raises:
+            OSError: if the file cannot be written to.
+        """
+        schema = foxglove.Schema(name=_FRAMES_SCHEMA, encoding="", data=b"")
+        channel = foxglove.Channel(FRAMES_TOPIC, schema=schema, message_encoding=_FRAMES_SCHEMA, context=self._context)
+        head = json.dumps(description).encode()
+        for begin in range(0, len(slots), _FRAMES_PER_MESSAGE):
+            part = slots[begin : begin + _FRAMES_PER_MESSAGE]
+            message = struct.pack("<I", len(head)) + head + part.tobytes()
+            channel.log(message, log_time=int(part["stamp_ns"][-1]) + self._offset_ns)
         self._file.check()
 
     def flush(self) -> None:
@@ -362,7 +387,7 @@ class Logged(NamedTuple):
     """Wall clock, since 1970."""
     message: dict[str, Any]
     """A JSON message as it is; of JointStates `name`, `position`, `velocity` and `effort` as lists; of
-    Point3InFrame `frame_id` and `point`; of Log `level`, `name` and `message`."""
+    Point3InFrame `frame_id` and `point`; of Log `level`, `name` and `message`; of Frames `description` and `slots`."""
 
 
 @dataclass(slots=True)
@@ -443,6 +468,9 @@ def _decode(schema: str, data: bytes) -> dict[str, Any]:
             parts = dict(_fields(data))
             texts = {"message": parts.get(3, b"").decode(), "name": parts.get(4, b"").decode()}
             return {"level": parts.get(2, 0), **texts}
+        case "robotctl.Frames":
+            (length,) = struct.unpack_from("<I", data)
+            return {"description": json.loads(data[4 : 4 + length]), "slots": data[4 + length :]}
         case _:
             message = json.loads(data)
             return dict(message)

@@ -58,7 +58,7 @@ def record_session(
     if path.exists():
         raise ConfigError(f"{path} already exists", "record to another file; recordings are never overwritten")
     recording = SessionRecording(path)
-    black_box = BlackBox(session.robot, session.link, path.with_suffix(""), about)
+    black_box = BlackBox(session.robot, session.link, path.with_suffix(""), about, frames=session.frames)
 
     def tripped(event: dict[str, Any]) -> None:
         black_box.on_trip(event)

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from robotctl.control.frame_ring import FrameRing
 from robotctl.control.loop import Loop
 from robotctl.control.operator import Verb
 from robotctl.control.shared import Link
@@ -41,6 +42,12 @@ def history_slots(robot: Robot) -> int:
     return round(HISTORY_S * robot.profile.servo_hz)
 
 
+def frame_slots(robot: Robot) -> int:
+    """Return how many frames a session of this robot remembers: per tick and drive one each way, a mark, one spare."""
+    drives = sum(joint.drive is not None for joint in robot.profile.joints) + 1
+    return history_slots(robot) * (2 * drives + 2)
+
+
 class Session(ABC):
     """Operator's side of a loop: requests, states, events, statistics.
 
@@ -51,6 +58,8 @@ class Session(ABC):
         self.robot = robot
         self.clock = clock
         self.link = link
+        self.frames: FrameRing | None = None
+        """The raw frames of the bus, where there is one."""
         self.judge = Judge(robot)
         self.statistics = TickStatistics(robot.period_ns)
         self.trips: list[dict[str, Any]] = []
@@ -299,7 +308,8 @@ class LockstepSession(Session):
         super().__init__(robot, clock, Link.local(robot.dof, history_slots(robot)))
         make = partial(open_backend, backend) if isinstance(backend, str) else backend
         self._rig = make(robot, clock, channel)
-        self.loop = Loop(robot, self._rig, clock, self.link, reset)
+        self.frames = FrameRing.local(frame_slots(robot)) if backend == "can" else None
+        self.loop = Loop(robot, self._rig, clock, self.link, reset, self.frames)
         self._next_ns = 0
 
     def open(self) -> None:

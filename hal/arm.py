@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
+from robotctl.hal.can.tap import Tap
 from robotctl.hal.errors import HardwareError
 from robotctl.hal.types import Command, GripperSample, Sample, Sent, Truth
 
@@ -39,6 +40,9 @@ class Arm(ABC):
     @abstractmethod
     def inspect_with(self, inspector: Inspector) -> None:
         """Let nothing leave from now on that `inspector` objects to."""
+
+    def record_frames(self, tap: Tap) -> None:  # noqa: B027 - most arms have nothing to show
+        """Show every frame of the bus to `tap` from now on. An arm without a bus has none to show."""
 
     @abstractmethod
     def connect(self) -> None:

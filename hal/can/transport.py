@@ -23,6 +23,7 @@ import can
 
 from robotctl.hal.can.channel import Channel
 from robotctl.hal.can.error_frames import ErrorLog
+from robotctl.hal.can.tap import Tap
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError
 
@@ -81,6 +82,8 @@ class Transport:
         """Ids on which only drives of ours may speak."""
         self.listener: Listener | None = None
         self.inspector: FrameInspector | None = None
+        self.tap: Tap | None = None
+        """Sees every frame that left or arrived."""
         self.refusal = ""
         """What the inspector said of the latest frames; empty if they went out."""
         self.sent = 0
@@ -135,6 +138,8 @@ class Transport:
             self._send_failed(error)
             return False
         self.sent += 1
+        if self.tap is not None:
+            self.tap.sent([(arbitration_id, data)], fd, self._clock.now_ns())
         self._failing_since = None
         return True
 
@@ -161,6 +166,8 @@ class Transport:
         self.sent += count
         if count:
             self._failing_since = None
+            if self.tap is not None:
+                self.tap.sent(frames if count == len(frames) else frames[:count], fd, self._clock.now_ns())
         return count
 
     # --- in ---------------------------------------------------------------------------------------------------------
@@ -170,7 +177,7 @@ class Transport:
         if self._lost:
             raise self._gone()
         now = self._clock.now_ns()
-        recv, routes, simulated = self._recv, self.routes, self.simulated
+        recv, routes, simulated, tap = self._recv, self.routes, self.simulated, self.tap
         wall = 0.0 if simulated else time.time()  # wall clock: the kernel stamps frames by it
         failures = 0
         for _ in range(DRAIN_LIMIT):
@@ -187,6 +194,9 @@ class Transport:
                 if self._poll is None or not self._poll.poll(0):
                     break
                 continue
+            stamp = now if simulated else _stamp(now, wall, message.timestamp)
+            if tap is not None:
+                tap.received(message, stamp)
             if message.is_error_frame:
                 self.error_frames += 1
                 self.errors.take(message.arbitration_id, message.data)
@@ -195,7 +205,7 @@ class Transport:
             data = message.data
             if len(data) == 8 and not message.is_extended_id and not message.is_remote_frame:
                 route = routes.get(message.arbitration_id << 4 | data[0] & 0xF)
-                if route is not None and route(data, now if simulated else _stamp(now, wall, message.timestamp)):
+                if route is not None and route(data, stamp):
                     continue
             self.unexpected += 1
             if message.arbitration_id in self.reply_ids:

@@ -18,7 +18,9 @@ from robotctl.hal.can.damiao.gripper import DamiaoGripper
 from robotctl.hal.can.damiao.motors import MOTORS
 from robotctl.hal.can.damiao.power import clear_faults, not_ready, switch_off
 from robotctl.hal.can.damiao.registers import ControlMode
+from robotctl.hal.can.damiao.replay import describe
 from robotctl.hal.can.damiao.verification import Eavesdropper, Expected, verify_drive
+from robotctl.hal.can.tap import Tap
 from robotctl.hal.can.transport import Transport, route_key
 from robotctl.hal.clock import Clock, VirtualClock
 from robotctl.hal.errors import ConfigError, DriveError, HardwareError
@@ -64,6 +66,7 @@ class DamiaoArm(Arm):
         self.warnings: list[str] = []
         self.identities: dict[str, Identity] = {}
         self._inspector: Inspector | None = None
+        self._tap: Tap | None = None
         self.gripper: DamiaoGripper | None = None
         self._robot = robot
         self._clock = clock
@@ -97,6 +100,11 @@ class DamiaoArm(Arm):
         if self._transport is not None:
             self._transport.inspector = inspector.frames
 
+    def record_frames(self, tap: Tap) -> None:
+        self._tap = tap
+        if self._transport is not None:
+            self._transport.tap = tap
+
     @property
     def channel(self) -> Channel | None:
         """The open channel; None before `connect` and after `close`."""
@@ -118,6 +126,7 @@ class DamiaoArm(Arm):
         transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
         if self._inspector is not None:
             transport.inspector = self._inspector.frames
+        transport.tap = self._tap
         self._channel, self._transport = channel, transport
         self._verified = self._enabled = False
         self._drives = [
@@ -173,6 +182,8 @@ class DamiaoArm(Arm):
             transport.listener = None
         raise_problems(problems)
         self._verified = True
+        if self._tap is not None:
+            self._tap.describe(describe(self._drives, self._robot.dof))
 
     def enable(self) -> None:
         """Enable every drive that is not, each holding the pose measured at that moment.
