@@ -13,7 +13,7 @@ from rich.table import Table
 from robotctl.cli.confirm import confirm
 from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.output import write_json
-from robotctl.control.workbench import Workbench, count, open_workbench
+from robotctl.control.workbench import Workbench, open_workbench
 from robotctl.hal.can.dump import DumpedMotor, read_dump, readable, write_dump
 from robotctl.hal.can.flash_log import MANY, PROMISED, writes
 from robotctl.hal.can.service import Difference, Motor
@@ -68,7 +68,7 @@ def set_id(
         old = drive.id
         confirm(_console, f"0x{old:02X} becomes 0x{new:02X}, with replies on 0x{reply:02X}", f"0x{new:02X}", yes)
         drive.set_id(new, reply)
-        _report(json, drive, {"old_id": old, "id": new, "reply_id": reply})
+        _report_all(bench, json, [(drive, {"old_id": old, "id": new, "reply_id": reply})])
 
 
 @motor_app.command()
@@ -81,7 +81,7 @@ def set_zero(
         who = f"{bench.name(drive.id)} (0x{drive.id:02X})"
         confirm(_console, f"{who}: where it stands now becomes its zero", f"0x{drive.id:02X}", yes)
         angle = drive.set_zero()
-        _report(json, drive, {"id": drive.id, "position": angle})
+        _report_all(bench, json, [(drive, {"id": drive.id, "position": angle})])
 
 
 @motor_app.command()
@@ -100,7 +100,7 @@ def set_watchdog(
         confirm(_console, f"{listed}: off after {milliseconds:g} ms of silence", f"{milliseconds:g}", yes)
         for drive in drives:
             drive.set_watchdog(1e-3 * milliseconds)
-        _report_all(json, [(drive, {"id": drive.id, "timeout_s": 1e-3 * milliseconds}) for drive in drives])
+        _report_all(bench, json, [(drive, {"id": drive.id, "timeout_s": 1e-3 * milliseconds}) for drive in drives])
     if not drives:
         raise typer.Exit(Exit.NO_HARDWARE)
 
@@ -148,7 +148,7 @@ def restore(
                 done.append((drive, {"id": drive.id, "written": [d._asdict() for d in different]}))
         if not done:
             _console.print("nothing to restore: they are as the file says")
-        _report_all(json, done)
+        _report_all(bench, json, done)
 
 
 @motor_app.command()
@@ -204,15 +204,11 @@ def _stranger(drive: Motor, wanted: DumpedMotor, owner: DumpedMotor | None) -> s
     return f"{what}; the file knows it as 0x{owner.id:02X} ({owner.name}): swapped?" if owner else what
 
 
-def _report(json: Path | None, drive: Motor, done: dict[str, Any]) -> None:
-    _report_all(json, [(drive, done)])
-
-
-def _report_all(json: Path | None, done: list[tuple[Motor, dict[str, Any]]]) -> None:
+def _report_all(bench: Workbench, json: Path | None, done: list[tuple[Motor, dict[str, Any]]]) -> None:
     """Count the writes, and say what was done."""
     report = []
     for drive, entry in done:
-        times = count(drive)
+        times = bench.count(drive)
         _console.print(f"[green]stored[/] 0x{drive.id:02X}: read back; flash written {times} times from this machine")
         if times >= MANY:
             _console.print(f"[yellow]that is much of the {PROMISED} times that its flash is promised to last[/]")

@@ -11,7 +11,7 @@ from robotctl.hal.can.channel import is_shared, open_channel
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.diagnosis import drives_of
 from robotctl.hal.can.dump import Dump, DumpedMotor
-from robotctl.hal.can.flash_log import count_write
+from robotctl.hal.can.flash_log import count_writes
 from robotctl.hal.can.scan import LAST_ID, scan
 from robotctl.hal.can.service import Difference, Motor, make_motor
 from robotctl.hal.can.transport import Transport
@@ -33,6 +33,7 @@ class Workbench:
         self._clock = clock
         self._protocol = robot.profile.can.protocol
         self._found = found
+        self._handed: list[Motor] = []
         self._profile: dict[int, tuple[str, Drive, ControlMode]] = {
             drive.id: (name, drive, mode) for name, drive, mode in drives_of(robot)
         }
@@ -72,6 +73,17 @@ class Workbench:
         _, drive, mode = self._profile[motor.id]
         return motor.departures(self.robot, drive, mode, motor.read())
 
+    def count(self, motor: Motor) -> int:
+        """Write down how often a drive's flash was written, and return how often that was from this machine so far."""
+        times, motor.flash_writes = motor.flash_writes, 0
+        return count_writes(motor.protocol, motor.serial(), times)
+
+    def count_all(self) -> None:
+        """Write that down for every drive whose flash was written, whatever came of it."""
+        for motor in self._handed:
+            if motor.flash_writes:
+                self.count(motor)
+
     def dump(self, motors: Sequence[Motor]) -> Dump:
         """Read everything that drives store."""
         return Dump(
@@ -106,7 +118,9 @@ class Workbench:
         return motor
 
     def _motor(self, motor_id: int) -> Motor:
-        return make_motor(self._protocol, self._transport, self._clock, motor_id, self.name(motor_id))
+        motor = make_motor(self._protocol, self._transport, self._clock, motor_id, self.name(motor_id))
+        self._handed.append(motor)
+        return motor
 
 
 @contextmanager
@@ -125,14 +139,13 @@ def open_workbench(channel: str, robot: Robot, clock: Clock) -> Iterator[Workben
             assert wiring is not None
             way = own_way(channel, wiring)
             found = [motor.id for motor in scan(opened, clock, LAST_ID, way).motors]
-            yield Workbench(robot, channel, Transport(opened, clock, way.bitrate), clock, found)
+            bench = Workbench(robot, channel, Transport(opened, clock, way.bitrate), clock, found)
+            try:
+                yield bench
+            finally:
+                bench.count_all()
         finally:
             opened.close()
     finally:
         if claimed is not None:
             claimed.close()
-
-
-def count(motor: Motor) -> int:
-    """Count one write to a drive's flash, and return how many there were from this machine."""
-    return count_write(motor.protocol, motor.serial())

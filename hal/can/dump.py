@@ -92,4 +92,4 @@ def write_dump(path: Path, dump: Dump) -> None:
 
 def readable(value: float) -> float | int:
     """Return a number as short as it can be, with everything that 32 bits hold of it."""
-    return int(value) if value.is_integer() else float(str(np.float32(value)))
+    return int(value) if float(value).is_integer() else float(str(np.float32(value)))

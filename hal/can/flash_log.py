@@ -12,8 +12,8 @@ MANY = PROMISED // 10
 """Writes from which people are warned."""
 
 
-def count_write(protocol: str, serial: int) -> int:
-    """Count one write to a drive's flash, and return how many there were from this machine.
+def count_writes(protocol: str, serial: int, times: int = 1) -> int:
+    """Count writes to a drive's flash, and return how many there were from this machine.
 
     Raises:
         ConfigError: if that cannot be written down.
@@ -21,7 +21,7 @@ def count_write(protocol: str, serial: int) -> int:
     path = _path()
     counts = _read(path)
     key = f"{protocol}:0x{serial:08X}"
-    counts[key] = counts.get(key, 0) + 1
+    counts[key] = counts.get(key, 0) + times
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.with_suffix(f".{os.getpid()}")

@@ -62,7 +62,7 @@ def sweep(
     """Scan a channel the way that its robot's profile says, and in other ways where somebody is missing.
 
     A host at a wrong bit rate disturbs whoever talks on the bus, so the others are tried only if nobody answers, if
-    one of the ids `wanted` does not, or if the search is to be `thorough`. A kernel interface keeps its bit rate.
+    one of the ids `wanted` does not and no losses explain it, or if the search is to be `thorough`. A kernel interface keeps its bit rate.
 
     Raises:
         ConfigError: if the channel's name has no known form, or the robot has no CAN drives.
@@ -76,7 +76,8 @@ def sweep(
         attempts = [scan(channel, clock, last_id, own_way(name, wiring))]
     for way in other_ways(name, wiring):
         found = {motor.id for attempt in attempts for motor in attempt.motors}
-        if found and found >= set(wanted) and not thorough:
+        explained = found >= set(wanted) or attempts[0].all_lossy
+        if found and explained and not thorough:
             break
         other = open_way(name, wiring, way)
         with _open(other):

@@ -38,6 +38,8 @@ class Motor(ABC):
     restorable: frozenset[str]
     """Parameters that `write` takes: not those that would cut the connection."""
     id: int
+    flash_writes: int
+    """Write cycles asked for through this object, and not counted yet."""
 
     @abstractmethod
     def serial(self) -> int:

@@ -35,6 +35,16 @@ class Attempt(NamedTuple):
     round_trip: RoundTrip | None = None
     """From request to reply; None if there was none."""
 
+    @property
+    def lossy(self) -> list[FoundMotor]:
+        """The drives that answered, but not always."""
+        return [motor for motor in self.motors if motor.lost > _LOSSY or motor.identity is None]
+
+    @property
+    def all_lossy(self) -> bool:
+        """Whether so many of several drives are lossy that the bus must be."""
+        return len(self.motors) > 1 and 2 * len(self.lossy) >= len(self.motors)
+
 
 def bus_findings(attempts: Sequence[Attempt], blind_spots: str) -> Iterator[Finding]:
     """Yield what the attempts say of the bus; the first is the way that the profile says."""
@@ -73,10 +83,10 @@ def _elsewhere(first: Attempt, other: Attempt) -> Finding:
 
 
 def _losses(attempt: Attempt) -> list[Finding]:
-    lossy = [motor for motor in attempt.motors if motor.lost > _LOSSY or motor.identity is None]
+    lossy = attempt.lossy
     errors = sum(attempt.errors.values())
     seen = f"; {_errors(attempt)}" if errors else ""
-    if lossy and 2 * len(lossy) >= len(attempt.motors) > 1:
+    if attempt.all_lossy:
         asked = sum(motor.asked for motor in attempt.motors)
         lost = asked - sum(min(motor.heard, motor.asked) for motor in attempt.motors)
         text = (

@@ -39,6 +39,7 @@ from robotctl.hal.robot import Robot
 
 _STORE_TIMEOUT_S = 0.2
 """For an answer to storing, which takes up to 30 ms."""
+_STORE_TRIES = 3
 _SECOND_VOICE_S = 0.01
 """How long to listen for a second drive that answers to the same id."""
 _LONGEST_WATCHDOG_S = 10.0
@@ -67,10 +68,14 @@ class DamiaoMotor(Motor):
         self.name = name
         self._transport = transport
         self._clock = clock
+        self.flash_writes = 0
+        self._serial: int | None = None
         self._replies: list[_Reply] = []
 
     def serial(self) -> int:
-        return int(self._read(Register.SN))
+        if self._serial is None:
+            self._serial = int(self._read(Register.SN))
+        return self._serial
 
     def status(self) -> str:
         return status_name(self._feedback()[0])
@@ -115,6 +120,7 @@ class DamiaoMotor(Motor):
         status, _ = self._feedback()
         if status != Status.DISABLED:
             raise self._error(f"reports {status_name(status)}", "remove the cause and power-cycle it first")
+        self.flash_writes += 1
         self._transport.send(self.id, encode_special(Special.SET_ZERO))
         self._transport.wait(lambda: False, _STORE_TIMEOUT_S)
         _, angle = self._feedback()
@@ -123,13 +129,12 @@ class DamiaoMotor(Motor):
         return angle
 
     def set_watchdog(self, seconds: float) -> None:
-        counts = round(seconds / TIMEOUT_UNIT_S)
-        if not 0.0 < seconds <= _LONGEST_WATCHDOG_S or counts == 0:
+        if not 0.5 * TIMEOUT_UNIT_S < seconds <= _LONGEST_WATCHDOG_S:
             raise ConfigError(
                 f"a watchdog of {seconds * 1e3:g} ms cannot be set",
                 f"more than 0, at most {_LONGEST_WATCHDOG_S * 1e3:g} ms; robotctl drives no arm without one",
             )
-        self.write({REGISTERS[Register.TIMEOUT].name: counts})
+        self.write({REGISTERS[Register.TIMEOUT].name: round(seconds / TIMEOUT_UNIT_S)})
 
     def differences(self, wanted: Mapping[str, float], found: Mapping[str, float]) -> list[Difference]:
         different = []
@@ -180,6 +185,7 @@ class DamiaoMotor(Motor):
         if voices > 1:
             raise self._error(f"{voices} drives answer to this id", "unplug all but one: each would take the order")
         status, _ = self._feedback()
+        self.serial()  # known from here on, so that writes can be counted even if it falls silent
         if status == Status.ENABLED:
             raise self._error("is enabled", "end what drives it; nothing is written to a drive that may move")
 
@@ -220,12 +226,15 @@ class DamiaoMotor(Motor):
         raise self._error(f"{REGISTERS[register].name} {found}, {value:g} was written", "is the value in its range?")
 
     def _store(self, expected: list[tuple[int, float]]) -> None:
-        """Copy RAM to flash, once, since each time wears it; then read back what should be there."""
-        self._send(RegisterCommand.SAVE, 0x01)
-        if not self._transport.wait(lambda: bool(self._replies), _STORE_TIMEOUT_S):
+        """Copy RAM to flash until that is confirmed, seldom, since it wears; then read back what should be there."""
+        for _ in range(_STORE_TRIES):
+            self.flash_writes += 1
+            self._send(RegisterCommand.SAVE, 0x01)
+            if self._transport.wait(lambda: bool(self._replies), _STORE_TIMEOUT_S):
+                break
+        else:
             raise self._error(
-                "did not confirm that it stored its registers",
-                "power-cycle it, then compare with `robotctl motor info`",
+                "did not confirm that it stored its registers", "power-cycle it, then look with `robotctl motor info`"
             )
         for register, value in expected:
             if not _same(register, value, self._read(register)):

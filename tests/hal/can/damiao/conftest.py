@@ -29,6 +29,7 @@ class ScriptedMotor:
     def __init__(self, motor_id: int, reply_id: int, ranges: Ranges, position: float = 0.0) -> None:
         self.id, self.reply_id, self.ranges, self.position = motor_id, reply_id, ranges, position
         self.status = 0
+        self.temperature = 28
         self.mute = False
         self.drop_next = 0
         self.copies = 1
@@ -48,10 +49,14 @@ class ScriptedMotor:
             Register.VMAX: ranges.vmax,
             Register.TMAX: ranges.tmax,
             Register.CAN_BR: 9,
+            Register.UV_VALUE: 15.0,
+            Register.VBUS: 24.0,
         }
 
     def feedback(self) -> bytes:
-        return encode_feedback(Feedback(self.id, self.status, self.position, 0.0, 0.0, 31, 28), self.ranges)
+        return encode_feedback(
+            Feedback(self.id, self.status, self.position, 0.0, 0.0, 31, self.temperature), self.ranges
+        )
 
     def on_frame(self, arbitration_id: int, data: bytes) -> bytes | None:
         if self.mute:

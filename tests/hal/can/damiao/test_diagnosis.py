@@ -13,7 +13,7 @@ from robotctl.hal.robot import load_robot
 
 
 def findings(bench):
-    return drive_findings(bench.robot, scan(Channel(bench.bus, fd=True, simulated=True), VirtualClock()))
+    return drive_findings(bench.robot, scan(Channel(bench.bus, fd=True, simulated=True), VirtualClock()).motors)
 
 
 def test_healthy_drives_are_fine(bench):
@@ -33,6 +33,12 @@ def test_healthy_drives_are_fine(bench):
         (lambda m: m.registers.update({Register.TIMEOUT: 1199}), Level.WARN, "before the watchman"),
         (lambda m: m.registers.update({Register.VMAX: 8.0}), Level.FAIL, "ranges"),
         (lambda m: m.registers.update({Register.CTRL_MODE: 2}), Level.WARN, "control mode 2"),
+        (lambda m: m.registers.update({Register.CAN_BR: 4}), Level.FAIL, "classic CAN"),
+        (lambda m: m.registers.update({Register.VBUS: 11.0}), Level.FAIL, "supply is 11.0 V, it needs 15.0"),
+        (lambda m: m.registers.update({Register.SW_VER: 5012}), Level.WARN, "5012 on 0x05, 5013 on 0x06 0x07"),
+        (lambda m: setattr(m, "position", 3.1), Level.FAIL, "its zero is wrong"),
+        (lambda m: setattr(m, "temperature", 85), Level.WARN, "85 °C"),
+        (lambda m: setattr(m, "temperature", 95), Level.FAIL, "95 °C; the arm is stopped at 90"),
     ],
 )
 def test_every_deviation_is_named(bench, change, level, word):
@@ -40,7 +46,7 @@ def test_every_deviation_is_named(bench, change, level, word):
     bad = [finding for finding in findings(bench) if finding.level is not Level.OK]
     assert [finding.level for finding in bad] == [level]
     assert word in bad[0].text
-    assert "0x05" in bad[0].name
+    assert "0x05" in bad[0].name + bad[0].text
     assert bad[0].remedy
 
 

@@ -5,9 +5,12 @@ import pytest
 from robotctl.hal.can.channel import Channel
 from robotctl.hal.can.damiao.codec import BROADCAST_ID
 from robotctl.hal.can.damiao.motors import MOTORS
+from robotctl.hal.can.damiao.probe import guess_models
 from robotctl.hal.can.damiao.registers import Register
-from robotctl.hal.can.scan import guess_models, scan
+from robotctl.hal.can.scan import scan
+from robotctl.hal.can.verdict import bus_findings
 from robotctl.hal.clock import VirtualClock
+from robotctl.hal.host import Level
 
 
 @pytest.fixture
@@ -29,7 +32,7 @@ def test_scan_only_reads(look, scripted_motor):
     assert {m.data[2] for m in bus.sent} == {0x33, 0xCC}
     assert not any(m.is_fd for m in bus.sent)
     assert all(motor.status == 0 and not motor.written for motor in motors)
-    assert found.hints == ()
+    assert {finding.level for finding in bus_findings([found], "")} == {Level.OK}
 
 
 def test_scan_tells_all_it_learned(look, scripted_motor):
@@ -55,21 +58,16 @@ def test_one_lost_reply_hides_nobody(look, scripted_motor):
 @pytest.mark.parametrize("replies", [(0x13, 0x13), (0x13, 0x23)])
 def test_two_motors_with_one_id(look, scripted_motor, replies):
     found, _ = look([scripted_motor(3, reply, MOTORS["DM4310"]) for reply in replies])
-    assert "id 0x03: 2 motors share it" in found.hints[0]
+    (finding,) = bus_findings([found], "")
+    assert (finding.name, finding.level) == ("0x03", Level.FAIL)
+    assert "2 motors share this id" in finding.text
 
 
 def test_a_missing_watchdog_is_hinted_at(look, scripted_motor):
     motor = scripted_motor(3, 0x13, MOTORS["DM4310"])
     motor.registers[Register.TIMEOUT] = 0
-    assert any("watchdog is off" in hint for hint in look([motor])[0].hints)
-
-
-def test_an_empty_bus_gets_advice(look):
-    found, _ = look([], last_id=8)
-    assert found.motors == ()
-    text = " ".join(found.hints)
-    for word in ("1 to 8", "powered", "ermination", "CAN FD"):
-        assert word in text
+    (finding,) = bus_findings([look([motor])[0]], "")
+    assert "watchdog is off" in finding.text
 
 
 def test_a_motor_with_strange_ranges_has_no_model():
