@@ -7,7 +7,7 @@ from datetime import datetime
 
 import robotctl
 from robotctl.control import registry
-from robotctl.hal.can.channel import is_shared, open_channel
+from robotctl.hal.can.channel import Channel, is_shared, open_channel
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.diagnosis import drives_of
 from robotctl.hal.can.dump import Dump, DumpedMotor
@@ -25,14 +25,16 @@ from robotctl.hal.robot import Robot
 class Workbench:
     """Drives that can be reached. Made by `open_workbench`."""
 
-    def __init__(self, robot: Robot, channel: str, transport: Transport, clock: Clock, found: Sequence[int]) -> None:
-        assert robot.profile.can is not None
+    def __init__(self, robot: Robot, channel: str, opened: Channel, clock: Clock) -> None:
+        wiring = robot.profile.can
+        assert wiring is not None
         self.robot = robot
         self.channel = channel
-        self._transport = transport
+        self._opened = opened
+        self._way = own_way(channel, wiring)
+        self._transport = Transport(opened, clock, wiring.bitrate)
         self._clock = clock
-        self._protocol = robot.profile.can.protocol
-        self._found = found
+        self._protocol = wiring.protocol
         self._handed: list[Motor] = []
         self._profile: dict[int, tuple[str, Drive, ControlMode]] = {
             drive.id: (name, drive, mode) for name, drive, mode in drives_of(robot)
@@ -46,7 +48,7 @@ class Workbench:
         """
         ids: list[int] = []
         for word in words or ["all"]:
-            ids += self._found if word == "all" else [self._id(word)]
+            ids += self._present() if word == "all" else [self._id(word)]
         return [self._motor(motor) for motor in dict.fromkeys(ids)]
 
     def one(self, word: str) -> Motor:
@@ -104,6 +106,9 @@ class Workbench:
             ],
         )
 
+    def _present(self) -> list[int]:
+        return [motor.id for motor in scan(self._opened, self._clock, LAST_ID, self._way).motors]
+
     def _id(self, word: str) -> int:
         for motor, (name, _, _) in self._profile.items():
             if word == name:
@@ -125,7 +130,7 @@ class Workbench:
 
 @contextmanager
 def open_workbench(channel: str, robot: Robot, clock: Clock) -> Iterator[Workbench]:
-    """Open a channel for service, look who answers, and close it in the end.
+    """Open a channel for service, and close it in the end. Sends nothing by itself.
 
     Raises:
         ConfigError: if the channel's name has no known form, or the robot has no CAN drives.
@@ -135,11 +140,7 @@ def open_workbench(channel: str, robot: Robot, clock: Clock) -> Iterator[Workben
     try:
         opened = open_channel(channel, robot, clock)
         try:
-            wiring = robot.profile.can
-            assert wiring is not None
-            way = own_way(channel, wiring)
-            found = [motor.id for motor in scan(opened, clock, LAST_ID, way).motors]
-            bench = Workbench(robot, channel, Transport(opened, clock, way.bitrate), clock, found)
+            bench = Workbench(robot, channel, opened, clock)
             try:
                 yield bench
             finally:

@@ -62,7 +62,8 @@ def sweep(
     """Scan a channel the way that its robot's profile says, and in other ways where somebody is missing.
 
     A host at a wrong bit rate disturbs whoever talks on the bus, so the others are tried only if nobody answers, if
-    one of the ids `wanted` does not and no losses explain it, or if the search is to be `thorough`. A kernel interface keeps its bit rate.
+    one of the ids `wanted` does not and no losses explain it, or if the search is to be `thorough`. A kernel interface
+    keeps its bit rate.
 
     Raises:
         ConfigError: if the channel's name has no known form, or the robot has no CAN drives.
