@@ -9,6 +9,7 @@ from rich.console import Console
 from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.findings import print_findings
 from robotctl.cli.output import write_json
+from robotctl.control.registry import claimed
 from robotctl.hal.can.diagnosis import channel_findings, profile_findings
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.host import Level, host_findings
@@ -29,7 +30,8 @@ def doctor(
         clock = MonotonicClock()
         findings = host_findings(clock) + profile_findings(model)
         if channel:
-            findings += channel_findings(model, clock, channel)
+            with claimed(channel):
+                findings += channel_findings(model, clock, channel)
         print_findings(console, findings, f"fit for {model.profile.title}?")
         if json is not None:
             entries = [finding._asdict() for finding in findings]

@@ -13,6 +13,7 @@ from rich.table import Table
 from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.findings import print_findings
 from robotctl.cli.output import write_json
+from robotctl.control.registry import claimed
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.found import FoundMotor
 from robotctl.hal.can.scan import LAST_ID, Scan, sweep
@@ -33,7 +34,9 @@ def scan(
     """Find the drives on a CAN bus, and say why nobody answers. Only reads; exit status 4 if nobody does."""
     console = Console(highlight=False)
     with readable_errors():
-        found = sweep(channel, load_robot(robot), MonotonicClock(), last, thorough=thorough)
+        model = load_robot(robot)
+        with claimed(channel):
+            found = sweep(channel, model, MonotonicClock(), last, thorough=thorough)
         for attempt in found.attempts:
             if attempt.motors:
                 console.print(_table(attempt.motors, f"drives on {channel}, {attempt.way}"))

@@ -7,11 +7,13 @@ gone, or whose pid was given to another process since, is removed when met.
 import json
 import os
 import socket
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 
+from robotctl.hal.can.channel import is_shared
 from robotctl.hal.errors import BusError
 
 
@@ -78,6 +80,17 @@ def claim(channel: str) -> socket.socket:
         mine.close()
         raise BusError(f"{channel} is in use by another robotctl", "end that one first") from None
     return mine
+
+
+@contextmanager
+def claimed(channel: str) -> Iterator[None]:
+    """Have a channel for this process alone, if others can reach what is behind it.
+
+    Raises:
+        BusError: if another process has it.
+    """
+    with claim(channel) if is_shared(channel) else nullcontext():
+        yield
 
 
 def unregister(pid: int) -> None:

@@ -7,7 +7,7 @@ from datetime import datetime
 
 import robotctl
 from robotctl.control import registry
-from robotctl.hal.can.channel import Channel, is_shared, open_channel
+from robotctl.hal.can.channel import Channel, open_channel
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.diagnosis import drives_of
 from robotctl.hal.can.dump import Dump, DumpedMotor
@@ -136,8 +136,7 @@ def open_workbench(channel: str, robot: Robot, clock: Clock) -> Iterator[Workben
         ConfigError: if the channel's name has no known form, or the robot has no CAN drives.
         BusError: if it cannot be opened, or another robotctl has it: nothing is set on an arm that runs.
     """
-    claimed = registry.claim(channel) if is_shared(channel) else None
-    try:
+    with registry.claimed(channel):
         opened = open_channel(channel, robot, clock)
         try:
             bench = Workbench(robot, channel, opened, clock)
@@ -147,6 +146,3 @@ def open_workbench(channel: str, robot: Robot, clock: Clock) -> Iterator[Workben
                 bench.count_all()
         finally:
             opened.close()
-    finally:
-        if claimed is not None:
-            claimed.close()

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from robotctl.cli.doctor import doctor
 from robotctl.cli.scan import scan
+from robotctl.control.registry import claim
 
 
 @pytest.fixture
@@ -63,3 +64,11 @@ def test_doctor_on_a_silent_bus(invoke):
 
 def test_doctor_on_a_missing_interface(invoke):
     assert invoke(doctor, "--channel", "socketcan:nosuch").exit_code == 4
+
+
+@pytest.mark.parametrize("verb", [scan, doctor])
+def test_a_channel_that_drives_an_arm_is_left_alone(invoke, verb):
+    with claim("slcan:/dev/nosuch"):
+        result = invoke(verb, "--channel", "slcan:/dev/nosuch")
+    assert result.exit_code == 4
+    assert "in use by another robotctl" in result.output

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from robotctl.control import registry
+from robotctl.control.frame_replay import replay_states
 from robotctl.control.operator import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.shared import Board
@@ -199,3 +200,21 @@ def test_what_limits_nothing_may_be_edited_meanwhile(tmp_path: Path, monkeypatch
     path.write_text(path.read_text().replace("title: Franka", "title: My"))
     with session:
         assert session.state is State.READY
+
+
+def test_the_frames_of_the_bus_reach_this_side_as_they_were_decoded():
+    robot = load_robot("openarm")
+    with ProcessSession(robot, "can", "emulated") as session:
+        session.advance(0.3)
+        frames = session.frames
+    ticks = {int(tick["stamp_ns"]): tick for tick in session.link.ticks.since(0)[0]}
+    states = list(replay_states(frames.snapshot(), frames.description))
+    assert len(states) == len(ticks) > 50
+    for state in states:
+        assert state.position.tobytes() == ticks[state.stamp_ns]["position"].tobytes()
+        assert state.effort.tobytes() == ticks[state.stamp_ns]["effort"].tobytes()
+
+
+def test_without_a_bus_no_memory_is_taken_for_frames():
+    with ProcessSession(load_robot("openarm"), "sim") as session:
+        assert session.frames is None

@@ -14,6 +14,7 @@ from robotctl.hal.can.damiao.codec import (
     decode_pos_vel,
     decode_register,
     decode_vel,
+    encode_special,
     is_feedback,
 )
 from robotctl.hal.can.damiao.faults import status_name
@@ -22,12 +23,7 @@ from robotctl.hal.can.damiao.registers import REGISTERS, decode_value
 from robotctl.hal.can.diagnosis import drives_of
 from robotctl.hal.robot import Robot
 
-_SPECIALS = {
-    b"\xff" * 7 + bytes([Special.ENABLE]): "ENABLE",
-    b"\xff" * 7 + bytes([Special.DISABLE]): "disable",
-    b"\xff" * 7 + bytes([Special.SET_ZERO]): "SET ZERO",
-    b"\xff" * 7 + bytes([Special.CLEAR_ERROR]): "clear error",
-}
+_SPECIALS = {encode_special(special): special.name.replace("_", " ") for special in Special}
 
 
 class _Known(NamedTuple):
