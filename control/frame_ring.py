@@ -48,7 +48,9 @@ class Flag(IntFlag):
     """The data of the slot before goes on."""
 
 
-_SENT, _MARK, _MORE = int(Flag.SENT), int(Flag.MARK), int(Flag.MORE)
+# As plain numbers, which are several times faster than flags.
+_SENT, _FD, _MARK, _MORE = int(Flag.SENT), int(Flag.FD), int(Flag.MARK), int(Flag.MORE)
+_KINDS = (int(Flag.EXTENDED), int(Flag.ERROR), int(Flag.REMOTE))
 
 
 class FrameRing:
@@ -89,7 +91,7 @@ class FrameRing:
     # --- the writer's -----------------------------------------------------------------------------------------------
 
     def sent(self, frames: Sequence[tuple[int, bytes]], fd: bool, stamp_ns: int) -> None:
-        flags = _SENT | Flag.FD if fd else _SENT
+        flags = _SENT | _FD if fd else _SENT
         head, slots, buffer, pack = self._head, self.slots, self._buffer, _SLOT.pack_into
         for arbitration_id, data in frames:
             pack(buffer, _HEADER + head % slots * 32, stamp_ns, arbitration_id, flags, len(data), 0, data)
@@ -98,10 +100,10 @@ class FrameRing:
 
     def received(self, frame: can.Message, stamp_ns: int) -> None:
         data = frame.data
-        flags = 2 if frame.is_fd else 0
+        flags = _FD if frame.is_fd else 0
         if frame.is_extended_id or frame.is_error_frame or frame.is_remote_frame:
-            flags |= Flag.EXTENDED * frame.is_extended_id
-            flags |= Flag.ERROR * frame.is_error_frame | Flag.REMOTE * frame.is_remote_frame
+            kinds = zip((frame.is_extended_id, frame.is_error_frame, frame.is_remote_frame), _KINDS, strict=True)
+            flags |= sum(flag for applies, flag in kinds if applies)
         head, length = self._head, len(data)
         at = _HEADER + head % self.slots * 32
         _SLOT.pack_into(self._buffer, at, stamp_ns, frame.arbitration_id, flags, length, 0, bytes(data[:_ROOM]))
