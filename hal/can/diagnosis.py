@@ -25,6 +25,7 @@ _AT_REST = 0.5
 """How far from its rest pose a joint of an arm without brakes may hang, rad; beyond, its zero is in doubt."""
 _WARM = 10.0
 """K below the temperature that stops the arm from which a drive is warned of, as the supervisor does."""
+_NOWHERE: Mapping[int, Way] = {}
 _FASTEST_CLASSIC = 1_000_000
 _COMFORTABLE_LOAD = 0.75
 """Bus load above which retransmissions and register traffic find no room."""
@@ -73,7 +74,8 @@ def channel_findings(robot: Robot, clock: Clock, name: str) -> list[Finding]:
         findings.append(_finding("bus", "round trip", Level.OK, f"p50 {trips.p50:.0f} us, p99 {trips.p99:.0f} us"))
     if way.fd != robot.profile.can.fd:
         findings.append(load_finding(robot, way))
-    return [*findings, *drive_findings(robot, found.motors, way)]
+    elsewhere = {motor.id: attempt.way for attempt in found.attempts[1:] for motor in attempt.motors}
+    return [*findings, *drive_findings(robot, found.motors, way, elsewhere)]
 
 
 def load_finding(robot: Robot, way: Way, area: str = "bus") -> Finding:
@@ -101,8 +103,17 @@ def _watchman_finding(robot: Robot) -> Finding:
     return _finding("profile", "watchman", Level.OK if in_time else Level.WARN, text, remedy)
 
 
-def drive_findings(robot: Robot, found: Sequence[FoundMotor], way: Way | None = None) -> list[Finding]:
-    """Compare the drives that answered with the profile; `way` is how they were asked, None for the profile's."""
+def drive_findings(
+    robot: Robot, found: Sequence[FoundMotor], way: Way | None = None, elsewhere: Mapping[int, Way] = _NOWHERE
+) -> list[Finding]:
+    """Compare the drives that answered with the profile.
+
+    Args:
+        robot: whose profile.
+        found: who answered.
+        way: how they were asked; None for the profile's.
+        elsewhere: who answered in another way, by id.
+    """
     motors = {motor.id: motor for motor in found}
     wiring = robot.profile.can
     fd = way.fd if way is not None else wiring is not None and wiring.fd
@@ -112,6 +123,10 @@ def drive_findings(robot: Robot, found: Sequence[FoundMotor], way: Way | None = 
         motor = motors.get(drive.id)
         who = f"{name} (0x{drive.id:02X})"
         if motor is None:
+            if drive.id in elsewhere:
+                text = f"answers only on {elsewhere[drive.id]}"
+                findings.append(_finding("drives", who, Level.FAIL, text, "see the bus above"))
+                continue
             others = "the others do: " if motors else ""
             remedy = f"{others}check its power, cable and id" + ("" if motors else ", termination, bit rate and CAN FD")
             findings.append(_finding("drives", who, Level.FAIL, "does not answer", remedy))
@@ -199,7 +214,7 @@ def _condition(robot: Robot, motor: FoundMotor, who: str, fd: bool) -> Iterator[
             who,
             Level.FAIL,
             text,
-            "set its register 35 (can_br) to 9 for 5 Mbit/s, or `fd: false` in the profile",
+            "set its register 35 (can_br) to 9 for 5 Mbit/s with the vendor's tool, or `fd: false` in the profile",
         )
 
 

@@ -72,12 +72,13 @@ def _elsewhere(first: Attempt, other: Attempt) -> Finding:
     if other.way.fd != first.way.fd:
         remedy = (
             "a drive set above 1 Mbit/s answers in CAN FD only, one at or below in classic CAN: set register 35 "
-            "(can_br) to 4 for 1 Mbit/s classic, or use an interface with CAN FD and say `fd: true` in the profile"
+            "(can_br) to 4 for 1 Mbit/s classic with the vendor's tool, or use an interface with CAN FD and say "
+            "`fd: true` in the profile"
         )
         return Finding("bus", "CAN FD", Level.FAIL, text, remedy)
     remedy = (
         f"one rate for all: set `bitrate: {other.way.bitrate}` in the profile's can section, or register 35 (can_br) "
-        f"of these drives to that of {rate_text(first.way.bitrate)}"
+        f"of these drives to that of {rate_text(first.way.bitrate)} with the vendor's tool"
     )
     return Finding("bus", "bit rate", Level.FAIL, text, remedy)
 

@@ -1,13 +1,17 @@
 """`robotctl motor`: what a person sees, what a script gets, and what is refused."""
 
+import io
 import json
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
+from robotctl.cli.confirm import confirm
 from robotctl.cli.main import app
 from robotctl.hal.can.dump import read_dump
 from robotctl.hal.can.flash_log import MANY, count_writes
+from robotctl.hal.errors import ConfigError
 
 
 @pytest.fixture(autouse=True)
@@ -36,6 +40,21 @@ def test_what_stays_needs_a_persons_word_or_yes(words, tmp_path):
     report = tmp_path / "done.json"
     assert "stored" in invoke(*words, "--yes", "--json", str(report))
     assert json.loads(report.read_text())[0]["flash_writes"] == 1
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_person_types_what_is_meant(monkeypatch):
+    console = Console(file=io.StringIO())
+    monkeypatch.setattr("sys.stdin", Terminal("0x03\n"))
+    confirm(console, "0x03 becomes zero", "0x03", yes=False)
+    for typed in ("y\n", "0x04\n", ""):
+        monkeypatch.setattr("sys.stdin", Terminal(typed))
+        with pytest.raises(ConfigError, match="nothing was written"):
+            confirm(console, "0x03 becomes zero", "0x03", yes=False)
 
 
 def test_many_writes_are_warned_of():

@@ -17,6 +17,8 @@ from robotctl.hal.can.damiao.codec import (
     encode_register,
     encode_special,
 )
+from robotctl.hal.can.damiao.registers import Register
+from robotctl.hal.can.error_frames import UNACKNOWLEDGED
 from robotctl.hal.clock import MonotonicClock, VirtualClock
 from robotctl.hal.errors import BusError, ConfigError
 from robotctl.hal.robot import Robot
@@ -24,6 +26,7 @@ from robotctl.sim.motors.bench import Bench
 from robotctl.sim.motors.ports import open_port
 from robotctl.sim.motors.server import BusPort, Port, Server
 from robotctl.sim.motors.terminal import SlcanPort
+from robotctl.sim.motors.trouble import PowerCut
 
 MS = 1_000_000
 
@@ -145,6 +148,27 @@ def test_fd_replies_are_lost_on_a_classic_port(panda: Robot) -> None:
     server.step()
     assert port.outgoing == []
     assert (server.received, server.answered, server.lost) == (1, 0, 1)
+
+
+@pytest.mark.parametrize("carries", [True, False])
+def test_hosts_are_told_what_their_controller_would_have_seen_where_that_can_be(panda: Robot, carries: bool) -> None:
+    port, bench = Stub(), Bench(panda, fd=True)
+    port.carries_errors = carries
+    bench.trouble.add(PowerCut())
+    port.incoming = [frame(1)]
+    Server(bench, port, VirtualClock()).step()
+    told = [(message.arbitration_id, message.is_error_frame) for message in port.outgoing]
+    assert told == ([(UNACKNOWLEDGED.error_class, True)] if carries else [])
+
+
+def test_drives_hear_the_bit_rate_of_the_host_alone(panda: Robot) -> None:
+    port, bench = Stub(), Bench(panda, fd=False)
+    server = Server(bench, port, VirtualClock())
+    bench.drive(1).preset(Register.CAN_BR, 3)
+    for bitrate, answers in ((500_000, [0x11]), (1_000_000, []), (250_000, [])):
+        port.bitrate, port.incoming, port.outgoing = bitrate, [frame(1)], []
+        server.step()
+        assert [message.arbitration_id for message in port.outgoing] == answers
 
 
 def test_a_port_survives_trouble_and_gives_up_on_a_broken_bus() -> None:
