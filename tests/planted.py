@@ -36,7 +36,7 @@ class Mistake(NamedTuple):
 
 MISTAKES = [
     Mistake("bit rate", ["--register=all:can_br=3"], "bus", "bit rate", "fail", ("500 kbit/s", "0x01", "0x08")),
-    Mistake("termination", ["--trouble=unterminated:all"], "bus", "termination", "fail", ("60 Ohm",)),
+    Mistake("termination", ["--trouble=unterminated:all:0.1"], "bus", "termination", "fail", ("60 Ohm",)),
     Mistake("CAN FD", ["--register=all:can_br=9"], "bus", "CAN FD", "fail", ("answers on CAN FD", "can_br")),
     Mistake(
         "duplicate id",

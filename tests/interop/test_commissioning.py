@@ -79,12 +79,12 @@ def test_motors_are_set_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_whoever_monitors_says_nothing(tmp_path: Path) -> None:
     with Emulator(tmp_path, "--adapters=2") as emulator:
         talker, listener = json.loads(emulator.report.read_text())["channel"].split(", ")
-        status, silent = ask(tmp_path, "monitor", "--channel", listener, "--robot", "openarm", "--seconds", "1.2")
+        status, silent = ask(tmp_path, "monitor", "--channel", listener, "--robot", "openarm", "--seconds", "0.3")
         assert (status, silent["frames"]) == (0, 0)
         with can.Bus(interface="slcan", channel=talker[6:], bitrate=1_000_000, sleep_after_open=0.05) as bus:
             thread = threading.Thread(target=speak, args=(bus, 30))
             thread.start()
-            _, heard = ask(tmp_path, "monitor", "--channel", listener, "--robot", "openarm", "--seconds", "2.5")
+            _, heard = ask(tmp_path, "monitor", "--channel", listener, "--robot", "openarm", "--seconds", "2.0")
             thread.join()
     rows = {row["id"]: row for row in heard["ids"]}
     assert set(rows) == {BROADCAST_ID, 0x14}
