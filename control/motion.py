@@ -48,6 +48,7 @@ class Motion:
         self._torque_shaper = TorqueShaper(robot, kinematics, self.scene)
         self._stoppable = StoppableMotion(robot, kinematics)
         self._torque: Vector | None = None
+        self._limits = robot.limits
         self._yielding = robot.profile.safety.reset_scale * robot.limits.velocity * robot.period_ns * 1e-9
         """Way of a servo period in which an arm gives way (n,), rad."""
         self._stale_ns = round(robot.profile.safety.feedback_stop_s * 1e9)
@@ -80,12 +81,16 @@ class Motion:
         return self.command
 
     def give_way(self, sample: Sample) -> None:
-        """Lead the arm slowly towards where it is pushed, so that its gains do not press against what it touches."""
-        reference, most = self.reference, self._yielding
+        """Lead the arm slowly towards where it is pushed, so that its gains do not press against what it touches.
+
+        Not past its limits: there it holds against whatever pushes it.
+        """
+        reference, most, limits = self.reference, self._yielding, self._limits
         if np.abs(reference.velocity).max() > _AT_REST:
             return  # it brakes first
         way = np.minimum(np.maximum(sample.position - reference.position, -most), most)
-        reference.resync(reference.position + way, self.rest)
+        least, farthest = np.minimum(limits.lower, reference.position), np.maximum(limits.upper, reference.position)
+        reference.resync(np.minimum(np.maximum(reference.position + way, least), farthest), self.rest)
 
     def take_back(self) -> None:
         """Go back to before the last command of `track`: it did not leave."""

@@ -1,11 +1,13 @@
-"""What a motion refuses to be built on."""
+"""What a motion refuses to be built on, and how an arm gives way."""
 
+import numpy as np
 import pytest
 
 from robotctl.control.kinematics import Kinematics
 from robotctl.control.motion import Motion
 from robotctl.hal.errors import ConfigError
-from robotctl.hal.robot import load_robot
+from robotctl.hal.robot import Robot, load_robot
+from robotctl.hal.types import Sample
 
 LOWER = "[0.0, -0.4, 0.0, -2.3, 0.0, 1.9, 0.785]"
 """Panda's home and rest, whose tool is 449 mm high, with the elbow bent more."""
@@ -35,3 +37,15 @@ def test_home_has_to_be_where_the_links_may_be(half: float, settings: tuple[str,
         build(POST % half, *settings)
     build(POST % half, *settings, "collision=null")
     build(POST % half, *settings, "collision.ignore=[[panda_link3, post]]")
+
+
+def test_an_arm_that_is_pushed_past_a_limit_does_not_give_way_any_further(panda: Robot) -> None:
+    motion = Motion(panda, Kinematics(panda))
+    at_limit = np.array(panda.profile.home)
+    at_limit[0], at_limit[1] = panda.limits.upper[0] - 1e-5, panda.limits.lower[1] + 1e-5
+    motion.begin(at_limit)
+    pushed = at_limit + np.array([0.05, -0.05, 0.05, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(500):
+        motion.give_way(Sample(0, pushed, 0.0 * pushed, 0.0 * pushed, np.zeros(7, np.int64), enabled=True))
+    led = motion.reference.position
+    assert led == pytest.approx([panda.limits.upper[0], panda.limits.lower[1], *pushed[2:]])

@@ -13,7 +13,7 @@ from robotctl.trials.scenario import Scenario
 from robotctl.trials.shaping import tolerated_scenario
 from robotctl.trials.stops import Expected, running, still, stop_scenario
 
-_PUSH = 1.1
+_PUSH = 1.5
 """Multiple of the torque that counts as contact."""
 _PUSH_S = 0.06
 _OBSERVED_S = 0.03
@@ -24,6 +24,8 @@ _DRAG = 0.15
 """Share of the torque that counts as contact, at a velocity cap."""
 _IN_THE_WAY_S = 0.5
 _SETTLE_S = 3.0
+_SWING_S = 6.0
+"""An arm of soft gains swings on them after it has run into something."""
 _FAST = 0.7
 """Share of a velocity cap."""
 
@@ -95,7 +97,7 @@ def scenarios(robot: Robot, _backend: str) -> list[Scenario]:
         category=Category.BRAKE_HOLD,
         within_s=0.1,
         or_else=((Protection.TRACKING, Category.BRAKE_OFF), (Protection.OVERSPEED, Category.BRAKE_OFF)),
-        rest_s=_SETTLE_S,
+        rest_s=_SWING_S,
         excused=frozenset({"velocity", "position", "sphere", "drift"}),
     )
     return [
