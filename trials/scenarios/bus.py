@@ -21,7 +21,7 @@ from robotctl.trials.orphans import orphan_scenario, without_bus
 from robotctl.trials.refusals import refusal_scenario
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.shaping import tolerated_scenario
-from robotctl.trials.stops import Expected, stop_scenario
+from robotctl.trials.stops import Expected, stop_scenario, untouchable
 
 _UNDELIVERED_TICKS = 5
 _COASTING_REST_S = 0.4
@@ -193,7 +193,11 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         ),
         orphan_scenario(14, "nobody listens", "nothing leaves the host any more", _blocked, without_bus),
         orphan_scenario(14, "unplugged", "the adapter is unplugged", _unplugged, without_bus),
-        stop_scenario(15, "flipped bits", "half the answers of a drive have a bit flipped", _flipped, sooner_or_later),
+        untouchable(
+            stop_scenario(
+                15, "flipped bits", "half the answers of a drive have a bit flipped", _flipped, sooner_or_later
+            )
+        ),
         tolerated_scenario(
             15,
             "twice",
