@@ -11,12 +11,11 @@ from rich.table import Table
 
 from robotctl.cli.errors import Exit, hear_interrupts, readable_errors
 from robotctl.cli.output import write_json
-from robotctl.hal.can.damiao.faults import status_name
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import load_robot
 from robotctl.sim.motors.bench import Bench
-from robotctl.sim.motors.damiao import DamiaoDrive
+from robotctl.sim.motors.drive import EmulatedDrive
 from robotctl.sim.motors.orders import REGISTER_FORM, TROUBLE_FORM, order_register, order_trouble
 from robotctl.sim.motors.ports import open_port
 from robotctl.sim.motors.server import Port, Server
@@ -91,8 +90,8 @@ def _open_log(path: Path) -> can.Listener:
         ) from None
 
 
-def _tell(drive: DamiaoDrive, before: int, silent_s: float) -> None:
-    change = f"{status_name(before)} -> {status_name(drive.status)}"
+def _tell(drive: EmulatedDrive, before: object, silent_s: float) -> None:
+    change = f"{drive.told(before)} -> {drive.told(drive.status)}"
     print(f"{drive.name}: {change}, {1e3 * silent_s:.0f} ms after the last frame", flush=True)
 
 
@@ -124,7 +123,7 @@ def _write(path: Path | None, robot: str, bench: Bench, port: Port, server: Serv
                 "model": drive.model,
                 "fd": drive.fd,
                 "status": drive.status,
-                "flash_cycles": drive.memory.cycles,
+                "flash_cycles": drive.cycles,
             }
             for drive in bench.drives
         ],

@@ -14,6 +14,7 @@ from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.findings import print_findings
 from robotctl.cli.output import write_json
 from robotctl.control.registry import claimed
+from robotctl.hal.can.cia402.scan import FoundNode
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.found import FoundMotor
 from robotctl.hal.can.scan import LAST_ID, Scan, sweep
@@ -40,10 +41,12 @@ def scan(
         for attempt in found.attempts:
             if attempt.motors:
                 console.print(_table(attempt.motors, f"drives on {channel}, {attempt.way}"))
+        if found.nodes:
+            console.print(_node_table(found.nodes, f"CANopen nodes on {channel}"))
         print_findings(console, [finding for finding in found.findings if _is_news(found, finding.level)])
         if json is not None:
             write_json(json, _report(found, channel))
-    if not found.motors:
+    if not found.motors and not found.nodes:
         raise typer.Exit(Exit.NO_HARDWARE)
 
 
@@ -61,11 +64,24 @@ def _table(motors: tuple[FoundMotor, ...], title: str) -> Table:
     return table
 
 
+def _node_table(nodes: tuple[FoundNode, ...], title: str) -> Table:
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=0)
+    for heading in ("node", "profile", "vendor", "product", "watchdog\nms", "status"):
+        table.add_column(heading, overflow="fold")
+    for node in nodes:
+        watchdog = f"{node.watchdog_s * 1e3:g}" if node.watchdog_s else "[bold red]off[/]"
+        table.add_row(
+            str(node.id), str(node.profile), f"0x{node.vendor:X}", f"0x{node.product:X}", watchdog, node.status
+        )
+    return table
+
+
 def _report(found: Scan, channel: str) -> dict[str, Any]:
     """Return a scan as JSON-ready data. Units: rad, s, V, degrees Celsius, bit/s; unknown values are null."""
     return {
         "channel": channel,
         "motors": [_entry(motor) for motor in found.motors],
+        "nodes": [dataclasses.asdict(node) for node in found.nodes],
         "findings": [finding._asdict() for finding in found.findings],
         "attempts": [
             {**attempt.way._asdict(), "motors": [_entry(motor) for motor in attempt.motors], "errors": attempt.errors}

@@ -1,6 +1,6 @@
 """Raw frames from a black box: decoded again into states, and handed on in formats that other tools read."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 
 from robotctl.control.frame_ring import FRAME_DTYPE, Flag
 from robotctl.control.recording import FRAMES_TOPIC, read_recording
+from robotctl.hal.can.cia402.replay import Replayed402
 from robotctl.hal.can.damiao.replay import ReplayedDrives
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.types import Vector
 
-DECODERS = {"damiao": ReplayedDrives}
+DECODERS: dict[str, Callable[[Mapping[str, Any]], ReplayedDrives | Replayed402]] = {
+    "damiao": ReplayedDrives,
+    "cia402": Replayed402,
+}
 """By the protocol that a description names."""
 _STATES_TOPIC = "/state/joints"
 EXPORTS = (".log", ".asc")

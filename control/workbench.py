@@ -18,7 +18,7 @@ from robotctl.hal.can.transport import Transport
 from robotctl.hal.can.ways import own_way
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError
-from robotctl.hal.profile import Drive
+from robotctl.hal.profile import DamiaoDrive
 from robotctl.hal.robot import Robot
 
 
@@ -34,9 +34,9 @@ class Workbench:
         self._way = own_way(channel, wiring)
         self._transport = Transport(opened, clock, wiring.bitrate)
         self._clock = clock
-        self._protocol = wiring.protocol
+        self._protocol = robot.profile.protocol
         self._handed: list[Motor] = []
-        self._profile: dict[int, tuple[str, Drive, ControlMode]] = {
+        self._profile: dict[int, tuple[str, DamiaoDrive, ControlMode]] = {
             drive.id: (name, drive, mode) for name, drive, mode in drives_of(robot)
         }
 

@@ -48,11 +48,28 @@ def read_document(path: Path, model: type[M], overrides: Sequence[str] = ()) -> 
     except ValidationError as error:
         problems = []
         for problem in error.errors():
-            loc = problem["loc"]
+            loc = _without_tags(data, problem["loc"])
             what = _WORDING.get(problem["type"], problem["msg"].removeprefix("Value error, "))
+            if problem["type"] == "union_tag_invalid":
+                loc.append(problem["ctx"]["discriminator"].strip("'_()"))
+                what = f"must be one of {problem['ctx']['expected_tags']}"
             key = ".".join(str(part) for part in loc)
             problems.append(f"{path}:{line_of(data, loc)}: {f'{key}: ' if key else ''}{what}")
         raise ConfigError("\n".join(problems), "correct the file; robotctl starts nothing until it is clean") from None
+
+
+def _without_tags(data: Any, loc: Sequence[str | int]) -> list[str | int]:
+    """Return a location without the names that pydantic puts in for the kinds of a union: no key of the document."""
+    kept: list[str | int] = []
+    for number, part in enumerate(loc, 1):
+        if isinstance(data, CommentedMap) and part not in data and number < len(loc):
+            continue
+        kept.append(part)
+        try:
+            data = data[part]
+        except (KeyError, IndexError, TypeError):
+            data = None
+    return kept
 
 
 def line_of(data: Any, loc: Sequence[str | int]) -> int:

@@ -4,9 +4,10 @@ Everything that depends on the robot stands here and nowhere else. Unknown keys,
 are refused. The files are `configs/robots/*.yaml`; `robotctl.hal.robot` loads them and checks them against the model.
 """
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 CLASSIC_HZ = 250
 """Highest servo rate of eight drives on classic CAN at 1 Mbit/s: 2.2 ms of wire time per cycle."""
@@ -43,16 +44,50 @@ class Drive(_Strict):
     """
 
     id: Annotated[int, Field(strict=True, ge=1, le=0x7F)]
-    """ESC_ID, the id the motor listens to."""
-    reply_id: Annotated[int, Field(strict=True, ge=1, le=0x7FF)]
-    """MST_ID, the id it answers with."""
-    motor: str
-    """Model, e.g. DM8009; its full-scale ranges are verified against the drive."""
+    """The id that the drive listens to: ESC_ID (DAMIAO), or its CANopen node id."""
     sign: Literal[-1, 1] = 1
     gear: Positive = 1.0
     """Motor turns per joint turn, beyond the gear that the drive itself accounts for."""
     offset: Finite = 0.0
     """Joint angle at the motor's zero, rad."""
+
+
+class DamiaoDrive(Drive):
+    """A DAMIAO drive in MIT mode."""
+
+    protocol: Literal["damiao"] = "damiao"
+    reply_id: Annotated[int, Field(strict=True, ge=1, le=0x7FF)]
+    """MST_ID, the id it answers with."""
+    motor: str
+    """Model, e.g. DM8009; its full-scale ranges are verified against the drive."""
+
+
+class Cia402Drive(Drive):
+    """A drive of the CiA 402 profile over CANopen. Every value is verified against the drive."""
+
+    protocol: Literal["cia402"]
+    id: Annotated[int, Field(strict=True, ge=1, le=0x7E)]
+    """CANopen node id. 127 is the host's own."""
+    resolution: Annotated[int, Field(strict=True, ge=1)]
+    """Position increments per motor turn (object 0x608F)."""
+    rated_torque: Positive
+    """Of the motor, Nm (object 0x6076). Torques on the wire are thousandths of it."""
+    vendor: Annotated[int, Field(strict=True, ge=0, le=0xFFFFFFFF)] | None = None
+    """Vendor id (object 0x1018:1); None for whoever made it."""
+    product: Annotated[int, Field(strict=True, ge=0, le=0xFFFFFFFF)] | None = None
+    """Product code (object 0x1018:2); None for any."""
+
+
+def _protocol(drive: Any) -> str:
+    """Return which kind of drive is meant: DAMIAO where nothing is said."""
+    if isinstance(drive, Drive):
+        return "cia402" if isinstance(drive, Cia402Drive) else "damiao"
+    return str(drive.get("protocol", "damiao")) if isinstance(drive, Mapping) else "damiao"
+
+
+AnyDrive = Annotated[
+    Annotated[DamiaoDrive, Tag("damiao")] | Annotated[Cia402Drive, Tag("cia402")], Discriminator(_protocol)
+]
 
 
 class Gains(_Strict):
@@ -84,7 +119,7 @@ class Joint(_Strict):
     torque_rate: Positive
     """Nm/s"""
     gains: Gains
-    drive: Drive | None = None
+    drive: AnyDrive | None = None
     """None for an arm without CAN drives."""
     armature: NotNegative = 0.0
     """Inertia of the motor's rotor as the joint feels it, where the model leaves it out, kg m^2."""
@@ -117,7 +152,7 @@ class GripperProfile(_Strict):
     """Opening speed, m/s."""
     gains: Gains
     """Of the first finger's joint; the others follow it."""
-    drive: Drive | None = None
+    drive: AnyDrive | None = None
     """Gripper motor. Its `offset` is unused."""
     motor_open: Finite = 1.0
     """Motor angle when fully open, rad; 0 when closed."""
@@ -265,9 +300,8 @@ class Collision(_Strict):
 
 
 class CanBus(_Strict):
-    """How the drives are wired."""
+    """How the drives are wired. Each says itself which protocol it speaks; they may differ on one bus."""
 
-    protocol: Literal["damiao"] = "damiao"
     fd: bool = True
     """CAN FD with bit-rate switch, else classic CAN."""
     bitrate: int = 1_000_000
@@ -335,6 +369,12 @@ class RobotProfile(_Strict):
             **{f"home_via.{index}": pose for index, pose in enumerate(self.home_via)},
         }
 
+    @property
+    def protocol(self) -> str:
+        """What the arm's drives speak; "" without drives."""
+        drive = self.joints[0].drive
+        return drive.protocol if drive is not None else ""
+
     payload: NotNegative = 0.0
     """Mass at the tool point that is known, kg; gravity and inertia of the arm's model include it."""
 
@@ -369,4 +409,12 @@ class RobotProfile(_Strict):
             )
         if self.can and any(joint.drive is None for joint in self.joints):
             raise ValueError("can: set, but not every joint has a drive")
+        if any(isinstance(joint.drive, Cia402Drive) for joint in self.joints):
+            if self.can and self.can.fd:
+                raise ValueError("can.fd: CANopen drives speak classic CAN; set it to false")
+            if self.category0 == "damp":
+                raise ValueError(
+                    "category0: CiA 402 drives cannot lower an arm, since their velocity loop holds what it damps; "
+                    "use disable, and brakes"
+                )
         return self

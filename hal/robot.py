@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import robotctl
+from robotctl.hal.can.cia402.units import misfits
 from robotctl.hal.can.damiao.motors import MOTORS
 from robotctl.hal.description import Description, load_description, locate
 from robotctl.hal.document import read_document
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.limits_text import digest, limits_text
-from robotctl.hal.profile import Joint, RobotProfile
+from robotctl.hal.profile import Cia402Drive, DamiaoDrive, Joint, RobotProfile
 from robotctl.hal.types import Vector, frozen
 
 CONFIGS = Path(robotctl.__file__).parent / "configs"
@@ -136,19 +137,24 @@ def _wider_than_model(joint: Joint, description: Description) -> list[str]:
         problems.append(f"{joint.name}: velocity {joint.velocity} exceeds the model's {model.velocity}")
     if model.effort is not None and joint.torque > model.effort:
         problems.append(f"{joint.name}: torque {joint.torque} exceeds the model's {model.effort}")
-    if joint.drive is not None:
-        motor = MOTORS.get(joint.drive.motor)
-        if motor is None:
-            problems.append(f"{joint.name}: unknown motor {joint.drive.motor!r}; known are {', '.join(MOTORS)}")
-            return problems
-        gear = joint.drive.gear
-        if joint.torque > motor.tmax * gear:
-            problems.append(
-                f"{joint.name}: torque {joint.torque} exceeds the {joint.drive.motor}'s {motor.tmax * gear}"
-            )
-        if joint.velocity > motor.vmax / gear:
-            problems.append(f"{joint.name}: velocity {joint.velocity} exceeds the motor's {motor.vmax / gear}")
-        reach = max(abs(bound - joint.drive.offset) for bound in joint.position) * gear
-        if reach > motor.pmax:
-            problems.append(f"{joint.name}: needs {reach:.2f} rad of the motor, whose range is {motor.pmax}")
+    match joint.drive:
+        case DamiaoDrive():
+            problems += _wider_than_motor(joint, joint.drive)
+        case Cia402Drive():
+            problems += misfits(joint, joint.drive)
+    return problems
+
+
+def _wider_than_motor(joint: Joint, drive: DamiaoDrive) -> list[str]:
+    motor, gear = MOTORS.get(drive.motor), drive.gear
+    if motor is None:
+        return [f"{joint.name}: unknown motor {drive.motor!r}; known are {', '.join(MOTORS)}"]
+    problems = []
+    if joint.torque > motor.tmax * gear:
+        problems.append(f"{joint.name}: torque {joint.torque} exceeds the {drive.motor}'s {motor.tmax * gear}")
+    if joint.velocity > motor.vmax / gear:
+        problems.append(f"{joint.name}: velocity {joint.velocity} exceeds the motor's {motor.vmax / gear}")
+    reach = max(abs(bound - drive.offset) for bound in joint.position) * gear
+    if reach > motor.pmax:
+        problems.append(f"{joint.name}: needs {reach:.2f} rad of the motor, whose range is {motor.pmax}")
     return problems

@@ -1,7 +1,8 @@
 """What messages to the drives ask for, as the guard reads them."""
 
+from collections.abc import Iterator, Sequence
 from enum import Enum, auto
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from robotctl.safety.trip import Protection
 
@@ -10,9 +11,11 @@ class Kind(Enum):
     """Kinds of message."""
 
     READ = auto()
-    """Feedback or a register."""
+    """Feedback or a register, and that the host is there."""
     MODE = auto()
-    """The control mode, in RAM."""
+    """The control mode, in RAM; how frames are laid out."""
+    START = auto()
+    """A drive is to take part in what goes on, without torque."""
     ENABLE = auto()
     DISABLE = auto()
     CLEAR = auto()
@@ -61,6 +64,36 @@ class Step(NamedTuple):
 
 
 EXACT = Step(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Move(NamedTuple):
+    """A motion that a message asks for."""
+
+    joint: int
+    """Its index."""
+    asked: Asked
+    step: Step
+    """What rounding may have cost it."""
+
+
+class Reading(Protocol):
+    """Reads the frames of a protocol."""
+
+    def read(
+        self, frames: Sequence[tuple[int, bytes]], measured: Sequence[tuple[float, float]]
+    ) -> Iterator[Kind | Move | str]:
+        """Return what frames (id, data) that leave together ask for; a text for one that is not on the list.
+
+        Args:
+            frames: all of them, in their order.
+            measured: position, rad, and velocity, rad/s, of each joint.
+        """
+        ...
+
+
+def stranger(arbitration_id: int, data: bytes) -> str:
+    """Return why a frame may not leave that no reading knows."""
+    return f"frame {arbitration_id:03X}#{data.hex()} is not on the list of this arm"
 
 
 class Refusal(NamedTuple):

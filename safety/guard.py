@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample
-from robotctl.safety.asked import EXACT, Asked, Kind, Refusal, Step
+from robotctl.safety.asked import EXACT, Asked, Kind, Move, Refusal
 from robotctl.safety.joint_guard import JointGuard
 from robotctl.safety.machine import ENABLED, State
 from robotctl.safety.trip import Protection
-from robotctl.safety.wire_guard import WireGuard
+from robotctl.safety.wire import reading_of
 
 _LONGEST = 26
 """Periods that a motion may make up for: as many as the loop does after a gap, and its own."""
@@ -30,6 +30,7 @@ PERMITTED: dict[Kind, frozenset[State]] = {
     # Whatever else happens, torque may be taken away.
     Kind.DISABLE: _OPEN,
     Kind.MODE: frozenset({State.SILENT}),
+    Kind.START: frozenset({State.SILENT, State.ARMED}),
     Kind.ENABLE: frozenset({State.ARMED}),
     Kind.TRACK: ENABLED,
     Kind.TORQUE: frozenset({State.RUN}),
@@ -59,7 +60,7 @@ class Guard:
         self._power = profile.safety.power
         self._most = round(_SURPLUS * _WINDOW_NS / robot.period_ns) + _RETRIES
         self._joints = [JointGuard(joint, profile.safety) for joint in profile.joints]
-        self._wire = WireGuard(profile)
+        self._wire = reading_of(profile)
         self._gains = [(joint.gains.kp, joint.gains.kd) for joint in profile.joints]
         self._measured = [(math.nan, math.nan)] * robot.dof
         self._now_ns: int | None = None
@@ -105,20 +106,17 @@ class Guard:
         still = [0.0] * n
         velocity = command.velocity.tolist() if command.mode is CommandMode.TRACK else still
         fields = zip(command.position.tolist(), velocity, gains, command.effort.tolist(), strict=True)
-        return self._motion([(i, Asked.of(p, v, kp, kd, t), EXACT) for i, (p, v, (kp, kd), t) in enumerate(fields)])
+        return self._motion([Move(i, Asked.of(p, v, kp, kd, t), EXACT) for i, (p, v, (kp, kd), t) in enumerate(fields)])
 
     def frames(self, frames: Sequence[tuple[int, bytes]]) -> str:
         motions = []
-        for arbitration_id, data in frames:
-            kind = self._wire.kind(arbitration_id, data)
-            if isinstance(kind, int):
-                joint = self._wire.joints[kind]
-                motions.append((kind, joint.asked(data, self._measured[kind][0]), joint.step))
-            elif kind is None:
-                text = f"frame {arbitration_id:03X}#{data.hex()} is not on the list of this arm"
-                return self._refuse(Refusal(Protection.FRAMES, text))
+        for found in self._wire.read(frames, self._measured):
+            if isinstance(found, Move):
+                motions.append(found)
+            elif isinstance(found, str):
+                return self._refuse(Refusal(Protection.FRAMES, found))
             else:
-                refusal = self._permit(kind)
+                refusal = self._permit(found)
                 if refusal:
                     return refusal
         return self._motion(motions) if motions else ""
@@ -131,8 +129,8 @@ class Guard:
             return ""
         return self._refuse(Refusal(Protection.FRAMES, f"{kind.name} is not permitted in state {state.name}"))
 
-    def _motion(self, motions: Sequence[tuple[int, Asked, Step]]) -> str:
-        """Judge what joints (index, motion, resolution) are asked together; all of it leaves, or nothing."""
+    def _motion(self, motions: Sequence[Move]) -> str:
+        """Judge what joints are asked together; all of it leaves, or nothing."""
         state = self._state()
         standing = state in _STANDING
         seconds = self._time_ns * 1e-9

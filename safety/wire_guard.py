@@ -1,6 +1,7 @@
 """The guard's own reading of DAMIAO frames: what kind of message a frame is, and what motion it asks of which joint."""
 
 import math
+from collections.abc import Iterator, Sequence
 
 from robotctl.hal.can.damiao.codec import (
     BROADCAST_ID,
@@ -13,8 +14,8 @@ from robotctl.hal.can.damiao.codec import (
 )
 from robotctl.hal.can.damiao.motors import MOTORS
 from robotctl.hal.can.damiao.registers import Register
-from robotctl.hal.profile import Drive, GripperProfile, RobotProfile
-from robotctl.safety.asked import Asked, Kind, Step
+from robotctl.hal.profile import DamiaoDrive, GripperProfile, RobotProfile
+from robotctl.safety.asked import Asked, Kind, Move, Step, stranger
 
 _SPECIALS: dict[int, Kind] = {
     Special.ENABLE: Kind.ENABLE,
@@ -30,7 +31,7 @@ _HALF = 0.5005
 class WireJoint:
     """One motor of the arm: its motion frames in joint coordinates."""
 
-    def __init__(self, drive: Drive) -> None:
+    def __init__(self, drive: DamiaoDrive) -> None:
         pmax, vmax, tmax = MOTORS[drive.motor]
         gear, square = drive.gear, drive.gear**2
         scale = drive.sign * gear
@@ -61,7 +62,7 @@ class WireJoint:
 class WireGripper:
     """The gripper's motor, in POS_FORCE mode."""
 
-    def __init__(self, gripper: GripperProfile, drive: Drive) -> None:
+    def __init__(self, gripper: GripperProfile, drive: DamiaoDrive) -> None:
         self.id = drive.id + Offset.POS_FORCE
         per_metre = abs(gripper.motor_open) / gripper.width
         self._least, self._most = sorted((0.0, gripper.motor_open))
@@ -78,18 +79,30 @@ class WireGripper:
 
 
 class WireGuard:
-    """Tells the kinds of all messages on an arm's bus."""
+    """Tells the kinds of all messages to an arm's DAMIAO drives."""
 
     def __init__(self, profile: RobotProfile) -> None:
-        drives = [joint.drive for joint in profile.joints if joint.drive]
+        drives = [joint.drive for joint in profile.joints if isinstance(joint.drive, DamiaoDrive)]
         self.joints = [WireJoint(drive) for drive in drives]
         self._index = {drive.id: index for index, drive in enumerate(drives)}
         self._motors = set(self._index)
         self._gripper: WireGripper | None = None
-        if profile.gripper and profile.gripper.drive:
+        if profile.gripper and isinstance(profile.gripper.drive, DamiaoDrive):
             drive = profile.gripper.drive
             self._motors.add(drive.id)
             self._gripper = WireGripper(profile.gripper, drive)
+
+    def read(
+        self, frames: Sequence[tuple[int, bytes]], measured: Sequence[tuple[float, float]]
+    ) -> Iterator[Kind | Move | str]:
+        """Return what frames that leave together ask for; a text for one that is not on the list."""
+        for arbitration_id, data in frames:
+            kind = self.kind(arbitration_id, data)
+            if isinstance(kind, int):
+                joint = self.joints[kind]
+                yield Move(kind, joint.asked(data, measured[kind][0]), joint.step)
+            else:
+                yield kind or stranger(arbitration_id, data)
 
     def kind(self, arbitration_id: int, data: bytes) -> Kind | int | None:
         """Return what a frame is: the index of the joint that it moves, its kind, or None for a stranger."""

@@ -47,7 +47,12 @@ def _inside(node: ast.AST, function: str) -> Iterator[tuple[str, ast.AST]]:
 
 
 def test_nobody_calls_the_function_that_clears_faults() -> None:
-    assert mentions("clear_faults") == {("hal/can/damiao/arm.py", "clear_faults")}
+    arms = {(f"hal/can/{protocol}/arm.py", "clear_faults") for protocol in ("damiao", "cia402")}
+    assert mentions("clear_faults") == {*arms, ("hal/can/damiao/passenger.py", "clear")}
+    # The gripper's is called with the arm's, which nobody calls.
+    assert mentions("clear") & {(file, "clear_faults") for file, _ in arms} == {
+        ("hal/can/cia402/arm.py", "clear_faults")
+    }
 
 
 def test_the_frame_that_clears_is_made_in_one_place_and_known_to_the_guard() -> None:
@@ -55,16 +60,30 @@ def test_the_frame_that_clears_is_made_in_one_place_and_known_to_the_guard() -> 
     assert mentions("CLEAR_ERROR") == {makes, knows}
 
 
+def test_the_word_that_resets_is_made_in_one_place_and_known_to_the_guard() -> None:
+    makes, knows = ("hal/can/cia402/machine.py", "controlword"), ("safety/wire_402.py", "module")
+    assert mentions("FAULT_RESET") == {makes, knows}
+    assert {file for file, _ in mentions("CLEAR") if "cia402" in file} == {
+        "hal/can/cia402/machine.py",
+        "hal/can/cia402/power.py",
+    }
+
+
 def test_what_is_looked_for_is_found() -> None:
     assert ("control/operator.py", "selftest") in mentions("verify")
     assert ("control/publisher.py", "report") in mentions("reaction_ms")
 
 
-def clears(data: bytes) -> bool:
-    return bytes(data) == b"\xff" * 7 + bytes([Special.CLEAR_ERROR])
+def clears(arbitration_id: int, data: bytes) -> bool:
+    """Return whether a frame clears a fault: DAMIAO's, or an RPDO1 or a written controlword with bit 7."""
+    if arbitration_id & 0x780 == 0x200:
+        return bool(data[0] & 0x80)
+    if arbitration_id & 0x780 == 0x600:
+        return data[0] >> 5 == 1 and data[1:3] == b"\x40\x60" and bool(data[4] & 0x80)
+    return data == b"\xff" * 7 + bytes([Special.CLEAR_ERROR])
 
 
-@pytest.mark.parametrize("name", ["panda", "openarm"])
+@pytest.mark.parametrize("name", ["panda", "openarm", "xarm7"])
 @pytest.mark.parametrize(
     "trouble",
     [Failure(motor_id=2), PowerCut(motor_id=3), Mute(motor_id=4)],
@@ -74,9 +93,9 @@ def test_no_frame_clears_a_fault_whatever_happens_and_whatever_is_asked(name: st
     session = LockstepSession(load_robot(name), "can")
     session.open()
     bus = session._rig.arm._channel.bus
-    frames: list[bytes] = []
+    frames: list[tuple[int, bytes]] = []
     receive = bus._receive
-    bus._receive = lambda arbitration_id, data: (frames.append(bytes(data)), receive(arbitration_id, data))
+    bus._receive = lambda number, data: (frames.append((number, bytes(data))), receive(number, data))
     session.prepare()
     session.begin()
     rng = np.random.default_rng(0)
@@ -97,6 +116,6 @@ def test_no_frame_clears_a_fault_whatever_happens_and_whatever_is_asked(name: st
             session.advance(0.5)
         bus.bench.trouble.remove(trouble)
     assert len(frames) > 5000
-    assert not any(clears(frame) for frame in frames)
+    assert not any(clears(*frame) for frame in frames)
     assert session._rig.arm._transport.withheld == 0  # the guard was not even asked for one
     assert session.state is not State.RUN

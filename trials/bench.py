@@ -12,7 +12,7 @@ from robotctl.control.operator import Verb
 from robotctl.control.shared import Link
 from robotctl.hal.arm import Arm
 from robotctl.hal.backend import Rig, open_backend
-from robotctl.hal.can.damiao.arm import DamiaoArm
+from robotctl.hal.can.arm import CanArm
 from robotctl.hal.clock import VirtualClock
 from robotctl.hal.errors import HardwareError
 from robotctl.hal.robot import Robot
@@ -38,7 +38,7 @@ Policy = Callable[["Bench", float], Target | None]
 
 def emulated_bus(arm: Arm) -> EmulatedBus | None:
     """Return the emulated bus that an arm is on, if it is on one."""
-    channel = arm.channel if isinstance(arm, DamiaoArm) else None
+    channel = arm.channel if isinstance(arm, CanArm) else None
     return channel.bus if channel is not None and isinstance(channel.bus, EmulatedBus) else None
 
 

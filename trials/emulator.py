@@ -11,14 +11,21 @@ from typing import NamedTuple, Self
 
 import can
 
+from robotctl.hal.can.cia402.codec import HOST_ID, SETPOINT, Mode, Service
+from robotctl.hal.can.cia402.machine import Word
 from robotctl.hal.can.damiao.codec import Special
 from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S
 from robotctl.hal.errors import HardwareError
+from robotctl.hal.robot import Robot
+from robotctl.trials.faults import on_canopen
 
 _START_S = 30.0
 _POLL_S = 0.05
-_LOST = re.compile(r"(\S+): ENABLED -> COMMUNICATION_LOST, (\d+) ms after the last frame")
-_OFF = re.compile(r"(\S+): ENABLED -> ")
+_LOST = re.compile(
+    r"(\S+): (?:ENABLED -> COMMUNICATION_LOST|OPERATION ENABLED -> .* \(HEARTBEAT_LOST\)), "
+    r"(\d+) ms after the last frame"
+)
+_OFF = re.compile(r"(\S+): (?:OPERATION )?ENABLED -> ")
 
 
 class Heard(NamedTuple):
@@ -34,20 +41,26 @@ class Heard(NamedTuple):
 class Emulator:
     """The motors of a robot. End it before the frames are asked for: then its log is complete."""
 
-    def __init__(self, folder: Path, robot: str, joints: int, watchdog_s: float) -> None:
-        """Start them.
-
-        Args:
-            folder: for their logs.
-            robot: name, or path of a profile.
-            joints: how many motors, ids 1 to this, are those of the arm.
-            watchdog_s: of every drive.
-        """
-        self._joints = joints
+    def __init__(self, folder: Path, robot: Robot, watchdog_s: float) -> None:
+        """Start them, with this watchdog in every drive, and their logs in a folder."""
+        self._canopen = on_canopen(robot)
+        self._ids = {joint.drive.id for joint in robot.profile.joints if joint.drive}
         self._told = folder / "emulate.log"
         self._frames = folder / "bus.log"
-        command = [sys.executable, "-m", "robotctl.cli.main", "emulate", "--robot", robot, "--log", str(self._frames)]
-        command += ["--register", f"all:TIMEOUT={round(watchdog_s / TIMEOUT_UNIT_S)}"]
+        command = [
+            sys.executable,
+            "-m",
+            "robotctl.cli.main",
+            "emulate",
+            "--robot",
+            str(robot.source),
+            "--log",
+            str(self._frames),
+        ]
+        if self._canopen:
+            command += ["--register", f"all:0x1016.1={HOST_ID << 16 | round(1e3 * watchdog_s)}"]
+        else:
+            command += ["--register", f"all:TIMEOUT={round(watchdog_s / TIMEOUT_UNIT_S)}"]
         with self._told.open("w") as output:
             self._process = subprocess.Popen(command, stdout=output, stdin=subprocess.DEVNULL)
 
@@ -86,10 +99,11 @@ class Emulator:
 
     def heard(self) -> list[Heard]:
         """Return what the joints' drives were sent."""
+        base, kind = (Service.RPDO1, _kind_402) if self._canopen else (0, _kind)
         return [
-            Heard(frame.timestamp, frame.arbitration_id, _kind(bytes(frame.data)))
+            Heard(frame.timestamp, frame.arbitration_id - base, kind(bytes(frame.data)))
             for frame in can.LogReader(self._frames)
-            if 1 <= frame.arbitration_id <= self._joints
+            if frame.arbitration_id - base in self._ids
         ]
 
 
@@ -97,3 +111,10 @@ def _kind(data: bytes) -> str:
     if data[:7] == b"\xff" * 7:
         return Special(data[7]).name
     return "track" if int.from_bytes(data, "big") >> 24 & 0xFFF else "damp"
+
+
+def _kind_402(data: bytes) -> str:
+    word, mode, _ = SETPOINT.unpack(data)
+    if word != Word.ENABLE_OPERATION:
+        return "DISABLE" if word == Word.DISABLE_VOLTAGE else Word(word).name
+    return "track" if mode == Mode.POSITION else "damp"

@@ -11,10 +11,12 @@ import numpy as np
 
 from robotctl.hal.can.damiao.codec import Status
 from robotctl.hal.can.damiao.faults import fault_of
+from robotctl.hal.profile import Cia402Drive
+from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
 from robotctl.sim import trouble as twin
 from robotctl.sim.motors import trouble as wire
-from robotctl.sim.motors.damiao import DamiaoDrive
+from robotctl.sim.motors.drive import EmulatedDrive
 from robotctl.trials.bench import Bench
 
 
@@ -176,8 +178,9 @@ def failed(bench: Bench, axis: int) -> Planted:
         arm.fail([axis], fault.code, fault.name, fault.hint)
         return Planted(lambda: None, lambda: bool(arm.read().faults))
     drive = _drive(bench, axis)
+    before = drive.status
     bench.motors.trouble.add(wire.Failure(motor_id=drive.id))
-    return Planted(lambda: None, lambda: drive.status == Status.OVER_CURRENT)
+    return Planted(lambda: None, lambda: drive.status != before)
 
 
 def unpowered(bench: Bench, axes: Iterable[int]) -> Planted:
@@ -248,7 +251,7 @@ def misread(bench: Bench, axis: int, offset: float) -> Planted:
         records = bench.since(begun)
         return bool(np.abs(records["position"] - records["true_position"])[:, axis].max() > 0.5 * abs(offset))
 
-    trouble = wire.Misreport(offset=offset * wiring.sign * wiring.gear, ranges=drive.ranges)
+    trouble = wire.Misreport(offset=offset * wiring.sign * wiring.gear, tell=drive.shifted)
     return on_wire(bench, trouble, [axis], showed)
 
 
@@ -262,7 +265,17 @@ def frozen(bench: Bench, axis: int) -> Planted:
         records = bench.since(begun)
         return bool(np.abs(records["velocity"] - records["true_velocity"])[:, axis].max() > 0.1)
 
-    return on_wire(bench, wire.Frozen(angle=drive.angle, ranges=drive.ranges), [axis], showed)
+    return on_wire(bench, wire.Frozen(angle=drive.angle, tell=drive.frozen), [axis], showed)
+
+
+def on_canopen(robot: Robot) -> bool:
+    """Return whether an arm has CiA 402 drives."""
+    return any(isinstance(joint.drive, Cia402Drive) for joint in robot.profile.joints)
+
+
+def faulty(bench: Bench) -> bool:
+    """Return whether an emulated drive has a fault."""
+    return bench.twin is None and any(drive.is_faulty for drive in bench.motors.drives)
 
 
 def cycle_power(bench: Bench) -> None:
@@ -293,7 +306,7 @@ def _seen(bench: Bench) -> Sample:
     return bench.arm.seen
 
 
-def _drive(bench: Bench, axis: int) -> DamiaoDrive:
+def _drive(bench: Bench, axis: int) -> EmulatedDrive:
     return bench.motors.drive(bench.robot.profile.joints[axis].name)
 
 

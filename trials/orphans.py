@@ -7,11 +7,13 @@ import numpy as np
 from robotctl.hal.errors import BusError
 from robotctl.hal.robot import Robot
 from robotctl.trials.bench import Bench
+from robotctl.trials.faults import on_canopen
 from robotctl.trials.scenario import Scenario, Trial
 from robotctl.trials.stops import running
 
 _WATCH_MS = 1500
 _LOOP_S = 0.5
+_QUICK_STOP_S = 0.1
 
 
 def nobody(_bench: Bench, _trial: Trial) -> None:
@@ -67,6 +69,8 @@ def _watch(bench: Bench, trial: Trial) -> None:
     torque = np.abs([state.effort for state in states]).max(axis=1)
     off = int(np.argmin(torque > 0.0)) if not torque.all() else len(torque)
     timeout_ms = 1e3 * robot.profile.safety.drive_timeout_s
+    if on_canopen(robot) and bench.backend == "can":
+        timeout_ms += 1e3 * _QUICK_STOP_S  # they slow down first
     trial.seen = "drives off by themselves"
     trial.figures["reaction_s"] = 1e-3 * off
     trial.require(off <= timeout_ms, f"the drives were off after {off} ms instead of {timeout_ms:.0f}")

@@ -13,7 +13,7 @@ from robotctl.safety.machine import State
 from robotctl.safety.trip import Category, Protection
 from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears, go_on
-from robotctl.trials.faults import Fault
+from robotctl.trials.faults import Fault, faulty
 from robotctl.trials.measure import measure_stop
 from robotctl.trials.policies import sway, velocities
 from robotctl.trials.scenario import Scenario, Trial
@@ -130,7 +130,12 @@ def _stop(bench: Bench, fault: Fault, expected: Expected, trial: Trial) -> None:
     trial.require(planted.showed(), "the fault did not show: it was not there")
     judge_stop(bench.robot, bench.since(onset), onset, expected, trial)
     if not trial.problems:
-        go_on(bench, planted, expected.clears, trial)
+        go_on(bench, planted, Clears.POWER if _takes_power(bench) else expected.clears, trial)
+
+
+def _takes_power(bench: Bench) -> bool:
+    """Return whether a drive is to blame, or has a fault by now, whatever stopped the arm first."""
+    return bench.trips[0]["protection"] == Protection.DRIVE.label or faulty(bench)
 
 
 def judge_trip(trips: Sequence[dict[str, Any]], expected: Expected, trial: Trial) -> None:

@@ -1,8 +1,12 @@
 """The CAN backend: an arm, and its gripper, on drives behind a CAN channel."""
 
+from robotctl.hal.arm import Gripper
 from robotctl.hal.backend import Rig
+from robotctl.hal.can.cia402.arm import Cia402Arm
 from robotctl.hal.can.damiao.arm import DamiaoArm
 from robotctl.hal.clock import Clock
+from robotctl.hal.errors import ConfigError
+from robotctl.hal.profile import Cia402Drive
 from robotctl.hal.robot import Robot
 
 DEFAULT_CHANNEL = "emulated"
@@ -17,5 +21,12 @@ def open_can(robot: Robot, clock: Clock, channel: str = "") -> Rig:
     Raises:
         ConfigError: if the profile describes no CAN drives, or such that the wire cannot carry.
     """
-    arm = DamiaoArm(robot, clock, channel or DEFAULT_CHANNEL)
-    return Rig(arm, arm.gripper)
+    profile = robot.profile
+    canopen = [isinstance(joint.drive, Cia402Drive) for joint in profile.joints]
+    if any(canopen) and not all(canopen):
+        raise ConfigError(f"{robot.source}: joints of one arm on different protocols", "use one for all joints")
+    if profile.gripper and isinstance(profile.gripper.drive, Cia402Drive):
+        raise ConfigError(f"{robot.source}: no gripper on a CiA 402 drive is known", "use a DAMIAO drive, or none")
+    arm: Cia402Arm | DamiaoArm = (Cia402Arm if any(canopen) else DamiaoArm)(robot, clock, channel or DEFAULT_CHANNEL)
+    gripper: Gripper | None = arm.gripper
+    return Rig(arm, gripper)

@@ -3,6 +3,9 @@
 from collections.abc import Iterator, Mapping, Sequence
 from math import pi
 
+from robotctl.hal.can.channel import open_channel
+from robotctl.hal.can.cia402.arm import cycle_load
+from robotctl.hal.can.cia402.scan import examine_drives
 from robotctl.hal.can.damiao.codec import Status
 from robotctl.hal.can.damiao.faults import status_name
 from robotctl.hal.can.damiao.motors import MOTORS
@@ -16,7 +19,7 @@ from robotctl.hal.can.ways import Way, own_way, rate_text
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError
 from robotctl.hal.host import Finding, Level
-from robotctl.hal.profile import CLASSIC_HZ, Drive
+from robotctl.hal.profile import CLASSIC_HZ, Cia402Drive, DamiaoDrive
 from robotctl.hal.robot import Robot
 
 _TAKE_OVER_S = 0.02
@@ -31,11 +34,12 @@ _COMFORTABLE_LOAD = 0.75
 """Bus load above which retransmissions and register traffic find no room."""
 
 
-def drives_of(robot: Robot) -> list[tuple[str, Drive, ControlMode]]:
-    """Return name, drive and needed control mode of every drive in a profile, the gripper's last."""
-    drives = [(joint.name, joint.drive, ControlMode.MIT) for joint in robot.profile.joints if joint.drive]
+def drives_of(robot: Robot) -> list[tuple[str, DamiaoDrive, ControlMode]]:
+    """Return name, drive and needed control mode of every DAMIAO drive in a profile, the gripper's last."""
+    joints = robot.profile.joints
+    drives = [(joint.name, joint.drive, ControlMode.MIT) for joint in joints if isinstance(joint.drive, DamiaoDrive)]
     gripper = robot.profile.gripper
-    if gripper and gripper.drive:
+    if gripper and isinstance(gripper.drive, DamiaoDrive):
         drives.append(("gripper", gripper.drive, ControlMode.POS_FORCE))
     return drives
 
@@ -61,9 +65,10 @@ def channel_findings(robot: Robot, clock: Clock, name: str) -> list[Finding]:
     if robot.profile.can is None:
         return []
     ids = {drive.id for _, drive, _ in drives_of(robot)}
+    nodes = {joint.drive.id for joint in robot.profile.joints if isinstance(joint.drive, Cia402Drive)}
     way = own_way(name, robot.profile.can)
     try:
-        found = sweep(name, robot, clock, max(LAST_ID, *ids), ids)
+        found = sweep(name, robot, clock, max(LAST_ID, *ids, *nodes), ids | nodes)
     except BusError as error:
         return [Finding("bus", name, Level.FAIL, error.what, error.remedy)]
     findings = [finding for finding in found.findings if not finding.name.startswith("0x")]
@@ -75,6 +80,7 @@ def channel_findings(robot: Robot, clock: Clock, name: str) -> list[Finding]:
     if way.fd != robot.profile.can.fd:
         findings.append(load_finding(robot, way))
     elsewhere = {motor.id: attempt.way for attempt in found.attempts[1:] for motor in attempt.motors}
+    findings += node_findings(robot, clock, name)
     return [*findings, *drive_findings(robot, found.motors, way, elsewhere)]
 
 
@@ -84,6 +90,9 @@ def load_finding(robot: Robot, way: Way, area: str = "bus") -> Finding:
     assert profile.can is not None
     count = len(drives_of(robot))
     cycle_s = 2e-9 * count * frame_time_ns(way.fd, way.bitrate, profile.can.data_bitrate)
+    nodes = sum(isinstance(joint.drive, Cia402Drive) for joint in profile.joints)
+    if nodes:
+        count, cycle_s = count + nodes, cycle_s + cycle_load(nodes, 1.0, way.bitrate)
     hz = profile.servo_hz if way.fd else min(profile.servo_hz, CLASSIC_HZ)
     load = cycle_s * hz
     level = Level.OK if load <= _COMFORTABLE_LOAD else Level.WARN if load < 1.0 else Level.FAIL
@@ -144,7 +153,32 @@ def drive_findings(
     return [*findings, *_firmware(found)]
 
 
-def _problems(robot: Robot, drive: Drive, mode: ControlMode, motor: FoundMotor, who: str) -> Iterator[Finding]:
+def node_findings(robot: Robot, clock: Clock, channel: str) -> list[Finding]:
+    """Read the CiA 402 drives of a profile back, and compare. Writes nothing.
+
+    Raises:
+        BusError: if the channel cannot be opened, or the bus is gone.
+    """
+    findings: list[Finding] = []
+    if robot.profile.protocol != "cia402":
+        return findings
+    opened = open_channel(channel, robot, clock)
+    try:
+        examined = list(examine_drives(robot, opened, clock))
+    finally:
+        opened.close()
+    for name, node, identity, problems, warnings in examined:
+        who = f"{name} (node {node})"
+        findings += [_finding("drives", who, Level.FAIL, problem.what, problem.remedy) for problem in problems]
+        findings += [_finding("drives", who, Level.WARN, warning) for warning in warnings]
+        if identity is not None and not problems:
+            watchdog = f"watchdog {identity.timeout_s * 1e3:g} ms"
+            text = f"vendor 0x{identity.vendor:X}, product 0x{identity.product:X}, {watchdog}"
+            findings.append(_finding("drives", who, Level.OK, text))
+    return findings
+
+
+def _problems(robot: Robot, drive: DamiaoDrive, mode: ControlMode, motor: FoundMotor, who: str) -> Iterator[Finding]:
     if len(motor.reply_ids) > 1:
         text = f"{len(motor.reply_ids)} motors share this id"
         yield _finding("drives", who, Level.FAIL, text, "unplug all but one, and give each an id of its own")
@@ -169,10 +203,10 @@ def _problems(robot: Robot, drive: Drive, mode: ControlMode, motor: FoundMotor, 
 
 
 def _mistaken(
-    drive: Drive,
+    drive: DamiaoDrive,
     motor: FoundMotor,
     who: str,
-    wanted: Mapping[int, tuple[str, Drive]],
+    wanted: Mapping[int, tuple[str, DamiaoDrive]],
     motors: Mapping[int, FoundMotor],
 ) -> Iterator[Finding]:
     """Look whether this is another motor than the profile says, and whether it has changed places with one."""
@@ -218,7 +252,7 @@ def _condition(robot: Robot, motor: FoundMotor, who: str, fd: bool) -> Iterator[
         )
 
 
-def _zero(robot: Robot, name: str, drive: Drive, motor: FoundMotor, who: str) -> Iterator[Finding]:
+def _zero(robot: Robot, name: str, drive: DamiaoDrive, motor: FoundMotor, who: str) -> Iterator[Finding]:
     """Look whether the measured angle can be, and whether it is where an arm without brakes hangs."""
     joints = {joint.name: index for index, joint in enumerate(robot.profile.joints)}
     if name not in joints or motor.identity is None or drive.motor not in motor.models:

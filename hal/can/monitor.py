@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import can
 
 from robotctl.hal.can.channel import FORMS, Channel, open_wired, options
+from robotctl.hal.can.cia402.words import Words402
 from robotctl.hal.can.damiao.words import DamiaoWords
 from robotctl.hal.can.error_frames import ErrorLog
 from robotctl.hal.can.ways import own_way
@@ -21,7 +22,7 @@ _FAILURES = 20
 Words = Callable[[int, bytes], str]
 """Takes id and data of a frame, and returns what it says; `?` where it does not know."""
 
-WORDS: dict[str, Callable[[Robot], Words]] = {"damiao": DamiaoWords}
+WORDS: dict[str, Callable[[Robot], Words]] = {"damiao": DamiaoWords, "cia402": Words402}
 """By protocol."""
 
 
@@ -90,8 +91,7 @@ class Monitor:
 
 def words_of(robot: Robot) -> Words:
     """Return how the frames of a robot's protocol are put in words."""
-    assert robot.profile.can is not None
-    return WORDS[robot.profile.can.protocol](robot)
+    return WORDS[robot.profile.protocol](robot)
 
 
 def open_listening(name: str, robot: Robot) -> Channel:

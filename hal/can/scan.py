@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from robotctl.hal.can.channel import Channel, open_channel
+from robotctl.hal.can.cia402.scan import FoundNode, scan_nodes
 from robotctl.hal.can.damiao.probe import probe
 from robotctl.hal.can.found import FoundMotor
 from robotctl.hal.can.transport import Transport
@@ -21,7 +22,7 @@ Probe = Callable[[Transport, Clock, int], tuple[FoundMotor, ...]]
 """Asks the ids 1 to a last one, and returns who answered. It may read, and nothing else."""
 
 PROBES: dict[str, Probe] = {"damiao": probe}
-"""By protocol, as in a profile's `can.protocol`."""
+"""By protocol, as in a drive's `protocol`. CANopen nodes tell other things of themselves, see `Scan.nodes`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,8 @@ class Scan:
     findings: tuple[Finding, ...] = ()
     statistics: dict[str, object] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
+    nodes: tuple[FoundNode, ...] = ()
+    """CANopen nodes that answered in the profile's way."""
 
 
 def scan(channel: Channel, clock: Clock, last_id: int = LAST_ID, way: Way | None = None) -> Attempt:
@@ -75,8 +78,10 @@ def sweep(
         raise ConfigError(f"robot {robot.profile.name!r} has no CAN drives")
     with _open(channel):
         attempts = [scan(channel, clock, last_id, own_way(name, wiring))]
+        silent = bool(attempts[0].failure)
+        nodes = () if silent else scan_nodes(channel, clock, last_id)
     for way in other_ways(name, wiring):
-        found = {motor.id for attempt in attempts for motor in attempt.motors}
+        found = {motor.id for attempt in attempts for motor in attempt.motors} | {node.id for node in nodes}
         explained = found >= set(wanted) or attempts[0].all_lossy
         if found and explained and not thorough:
             break
@@ -84,7 +89,9 @@ def sweep(
         with _open(other):
             attempts.append(scan(other, clock, last_id, way))
     first = attempts[0]
-    return Scan(first.motors, tuple(bus_findings(attempts, blind_spots(name))), first.statistics, tuple(attempts))
+    # Where only nodes answer, DAMIAO drives are not missed.
+    findings = () if nodes and not first.motors else tuple(bus_findings(attempts, blind_spots(name)))
+    return Scan(first.motors, findings, first.statistics, tuple(attempts), nodes)
 
 
 @contextmanager

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 from robotctl.hal.can.transport import Transport
 from robotctl.hal.clock import Clock
-from robotctl.hal.profile import Drive
+from robotctl.hal.errors import ConfigError
+from robotctl.hal.profile import DamiaoDrive
 from robotctl.hal.robot import Robot
 
 Parameters = dict[str, float]
@@ -82,7 +83,7 @@ class Motor(ABC):
         """Compare settings, as exactly as the drive stores them; what it measures, or only it can know, is left out."""
 
     @abstractmethod
-    def departures(self, robot: Robot, drive: Drive, mode: int, found: Mapping[str, float]) -> list[Difference]:
+    def departures(self, robot: Robot, drive: DamiaoDrive, mode: int, found: Mapping[str, float]) -> list[Difference]:
         """Compare with what a robot's profile says of this drive; `mode` is the control mode that it needs."""
 
 
@@ -91,9 +92,18 @@ MotorFactory = Callable[[Transport, Clock, int, str], Motor]
 
 
 def make_motor(protocol: str, transport: Transport, clock: Clock, motor_id: int, name: str) -> Motor:
-    """Return a drive of the named protocol. Sends nothing."""
+    """Return a drive of the named protocol. Sends nothing.
+
+    Raises:
+        ConfigError: if its drives are set up with other tools.
+    """
     # Imported here, since the protocols themselves are written against this module.
     from robotctl.hal.can.damiao.desk import DamiaoMotor
 
     makers: dict[str, MotorFactory] = {"damiao": DamiaoMotor}
+    if protocol not in makers:
+        raise ConfigError(
+            f"drives of the protocol {protocol!r} are not set up one by one here",
+            "use the vendor's tool; scan reads them",
+        )
     return makers[protocol](transport, clock, motor_id, name)

@@ -48,7 +48,7 @@ _OLDEST_STAMP_S = 0.1
 _LOAD_WINDOW_NS = 500_000_000
 
 Route = Callable[[bytearray, int], bool]
-"""Takes the 8 data bytes and the receive stamp in ns; returns whether the frame was understood."""
+"""Takes the data bytes (8 of them in `routes`) and the receive stamp in ns; returns whether they were understood."""
 
 Listener = Callable[[int, bytes], None]
 """Takes the id and the data of a frame that no route understood."""
@@ -68,7 +68,7 @@ class RoundTrip(NamedTuple):
 class Transport:
     """An open channel, with routes for what arrives and counters for what happens.
 
-    `routes` is keyed by `route_key`. All counters count from the opening.
+    `routes` is keyed by `route_key`, `by_id` by the id alone. All counters count from the opening.
 
     Raises:
         BusError: from every method but `close` and `statistics`, once the interface is gone.
@@ -78,6 +78,8 @@ class Transport:
         self.fd = channel.fd
         self.simulated = channel.simulated
         self.routes: dict[int, Route] = {}
+        self.by_id: dict[int, Route] = {}
+        """Routes of ids with one sender and frames of any length, as CANopen has them; tried after `routes`."""
         self.reply_ids: set[int] = set()
         """Ids on which only drives of ours may speak."""
         self.listener: Listener | None = None
@@ -159,7 +161,10 @@ class Transport:
         send, fd, message = self._send, self.fd, can.Message
         try:
             for arbitration_id, data in frames:
-                send(message(0.0, arbitration_id, False, False, False, None, 8, data, fd, False, fd), SEND_TIMEOUT_S)
+                send(
+                    message(0.0, arbitration_id, False, False, False, None, len(data), data, fd, False, fd),
+                    SEND_TIMEOUT_S,
+                )
                 count += 1
         except (can.CanError, OSError) as error:
             self._send_failed(error)
@@ -177,7 +182,7 @@ class Transport:
         if self._lost:
             raise self._gone()
         now = self._clock.now_ns()
-        recv, routes, simulated, tap = self._recv, self.routes, self.simulated, self.tap
+        recv, routes, by_id, simulated, tap = self._recv, self.routes, self.by_id, self.simulated, self.tap
         wall = 0.0 if simulated else time.time()  # wall clock: the kernel stamps frames by it
         failures = 0
         for _ in range(DRAIN_LIMIT):
@@ -203,8 +208,9 @@ class Transport:
                 continue
             self.received += 1
             data = message.data
-            if len(data) == 8 and not message.is_extended_id and not message.is_remote_frame:
-                route = routes.get(message.arbitration_id << 4 | data[0] & 0xF)
+            if not message.is_extended_id and not message.is_remote_frame:
+                route = routes.get(message.arbitration_id << 4 | data[0] & 0xF) if len(data) == 8 else None
+                route = route or by_id.get(message.arbitration_id)
                 if route is not None and route(data, stamp):
                     continue
             self.unexpected += 1

@@ -5,20 +5,22 @@ own loop has to be stepped, or something falls due: a watchdog, a late reply, a 
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from heapq import heappop, heappush
 from random import Random
 
-from robotctl.hal.can.damiao.codec import BROADCAST_ID, Offset, decode_register
+from robotctl.hal import profile as wired
+from robotctl.hal.can.damiao.codec import BROADCAST_ID, decode_register
 from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S, ControlMode
 from robotctl.hal.can.error_frames import GARBLED, UNACKNOWLEDGED, ErrorFrame
 from robotctl.hal.errors import ConfigError
-from robotctl.hal.profile import Drive, RobotProfile
 from robotctl.hal.robot import Robot
-from robotctl.sim.motors.damiao import FOREVER, DamiaoDrive
+from robotctl.sim.motors.cia402 import Cia402Drive
+from robotctl.sim.motors.damiao import DamiaoDrive
+from robotctl.sim.motors.drive import FOREVER, EmulatedDrive, Handler, Reply
 from robotctl.sim.motors.memory import Memory, factory_values
 from robotctl.sim.motors.shaft import Shaft
-from robotctl.sim.motors.trouble import Reply, Trouble
+from robotctl.sim.motors.trouble import Trouble
 from robotctl.sim.plant import PHYSICS_STEP_NS, WATCHDOG_SHARE, Plant
 
 _STEP_S = PHYSICS_STEP_NS * 1e-9
@@ -27,11 +29,6 @@ _WARM_NS = 100_000_000
 
 _ERRORS = 256
 """Error frames kept for a bus that does not take them."""
-
-_FD_NOMINAL = 1_000_000
-"""Arbitration rate of a drive that is set to CAN FD, bit/s: the faster one is its data phase's."""
-
-_Handler = Callable[[bytes, int], bytes | None]
 
 
 class Bench:
@@ -55,12 +52,12 @@ class Bench:
         """
         profile = robot.profile
         if profile.can is None:
-            raise ConfigError(f"robot {profile.name!r} has no CAN drives to emulate", "use panda or openarm")
+            raise ConfigError(f"robot {profile.name!r} has no CAN drives to emulate", "use panda, openarm or xarm7")
         self.plant = Plant(robot, start_ns)
         self.replies: deque[Reply] = deque()
         self.errors: deque[ErrorFrame] = deque(maxlen=_ERRORS)
         """What the host's controller would tell of the frames that it sent."""
-        self.drives: list[DamiaoDrive] = []
+        self.drives: list[EmulatedDrive] = []
         self.now_ns = start_ns
         self.trouble = Troubles(self, seed)
         self._nominal = profile.can.bitrate
@@ -68,29 +65,13 @@ class Bench:
         self._order = 0
         self._watch_ns = FOREVER
         self._next_ns = FOREVER
-        self._routes: dict[int, list[tuple[DamiaoDrive, _Handler]]] = {}
-        self._servos: list[DamiaoDrive] = []
-        for axis, (name, wiring, shaft) in enumerate(_shafts(profile, self.plant)):
-            mode = ControlMode.MIT if axis < robot.dof else ControlMode.POS_FORCE
-            timeout = round(WATCHDOG_SHARE * profile.safety.drive_timeout_s / TIMEOUT_UNIT_S)
-            values = factory_values(
-                wiring.motor, wiring.id, wiring.reply_id, mode, timeout, profile.can.fd if fd is None else fd
-            )
-            noise = (profile.twin.noise_position, profile.twin.noise_velocity) if axis < robot.dof else (0.0, 0.0)
-            self.drives.append(
-                DamiaoDrive(
-                    name,
-                    wiring.motor,
-                    Memory(values),
-                    shaft,
-                    self._refresh,
-                    self.at,
-                    delay_ns=round(profile.twin.delay_s * 1e9) if axis < robot.dof else 0,
-                    noise=(noise[0] * wiring.gear, noise[1] * wiring.gear),
-                    seed=seed + axis,
-                )
-            )
-        self._refresh()
+        self._routes: dict[int, list[tuple[EmulatedDrive, Handler]]] = {}
+        self._servos: list[EmulatedDrive] = []
+        self._damiao: list[DamiaoDrive] = []
+        """Those that register frames may name."""
+        self.drives += _drives(self, robot, profile.can.fd if fd is None else fd, seed)
+        self._damiao += [drive for drive in self.drives if isinstance(drive, DamiaoDrive)]
+        self.refresh()
         self.at(start_ns + _WARM_NS, self._warm)
 
     @property
@@ -102,9 +83,9 @@ class Bench:
     def nominal(self, bitrate: int) -> None:
         if bitrate != self._nominal:
             self._nominal = bitrate
-            self._refresh()
+            self.refresh()
 
-    def drive(self, which: str | int) -> DamiaoDrive:
+    def drive(self, which: str | int) -> EmulatedDrive:
         """Return a drive by its joint's name or by its present id.
 
         Raises:
@@ -151,6 +132,22 @@ class Bench:
         heappush(self._events, (time_ns, self._order, action))
         self._next_ns = min(self._next_ns, time_ns)
 
+    def say(self, drive: EmulatedDrive, arbitration_id: int, data: bytes) -> None:
+        """Put a frame of a drive's on the wire now, in CAN FD if that is what it speaks."""
+        self._answer(drive, Reply(arbitration_id, data, drive.fd, self.now_ns))
+
+    def refresh(self) -> None:
+        """Look again at what drives may change: their ids, bit rates, modes, status and watchdogs."""
+        routes: dict[int, list[tuple[EmulatedDrive, Handler]]] = {}
+        for drive in self.drives:
+            for arbitration_id, handler in drive.routes(self._nominal).items():
+                routes.setdefault(arbitration_id, []).append((drive, handler))
+        self._routes = routes
+        self._error = self._find_error()
+        self._servos = [drive for drive in self.drives if drive.is_servoing]
+        self._watch_ns = min((drive.deadline_ns for drive in self.drives), default=FOREVER)
+        self._next_ns = min(self._watch_ns, self._events[0][0] if self._events else FOREVER)
+
     # --- time -------------------------------------------------------------------------------------------------------
 
     def _run(self, to_ns: int) -> None:
@@ -181,38 +178,19 @@ class Bench:
 
     # --- frames -----------------------------------------------------------------------------------------------------
 
-    def _refresh(self) -> None:
-        """Look again at what drives may change: their ids, bit rates, modes, status and watchdogs."""
-        routes: dict[int, list[tuple[DamiaoDrive, _Handler]]] = {}
-        for drive in self.drives:
-            if self._hears(drive):
-                routes.setdefault(drive.id + Offset.MIT, []).append((drive, drive.on_mit))
-                routes.setdefault(drive.id + Offset.POS_VEL, []).append((drive, drive.on_pos_vel))
-                routes.setdefault(drive.id + Offset.VEL, []).append((drive, drive.on_vel))
-                routes.setdefault(drive.id + Offset.POS_FORCE, []).append((drive, drive.on_pos_force))
-        self._routes = routes
-        self._error = self._find_error()
-        self._servos = [drive for drive in self.drives if drive.is_servoing]
-        self._watch_ns = min((drive.deadline_ns for drive in self.drives), default=FOREVER)
-        self._next_ns = min(self._watch_ns, self._events[0][0] if self._events else FOREVER)
-
-    def _hears(self, drive: DamiaoDrive) -> bool:
-        """Return whether a drive has power and its arbitration phase runs at the bus's bit rate."""
-        return drive.powered and self._nominal == (_FD_NOMINAL if drive.fd else drive.bitrate)
-
     def _find_error(self) -> ErrorFrame | None:
         """Return what happens to every frame of the host: nobody is there, or some hear it at another bit rate."""
         powered = [drive for drive in self.drives if drive.powered]
         if not powered:
             return UNACKNOWLEDGED
-        return None if all(self._hears(drive) for drive in powered) else GARBLED
+        return None if all(drive.routes(self._nominal) for drive in powered) else GARBLED
 
     def _on_register(self, data: bytes) -> None:
-        for drive in self.drives:
+        for drive in self._damiao:
             # The reply to a change of id or bit rate still goes out the old way.
             reply_id, fd = drive.reply_id, drive.fd
             frame = decode_register(data, drive.id)
-            if frame is None or not self._hears(drive):
+            if frame is None or not drive.routes(self._nominal):
                 continue
             if self.trouble.active and not self.trouble.hears(drive):
                 continue
@@ -220,14 +198,14 @@ class Bench:
             if reply is not None:
                 self._answer(drive, Reply(reply_id, reply, fd, self.now_ns))
 
-    def _receive_troubled(self, routes: list[tuple[DamiaoDrive, _Handler]], data: bytes) -> None:
+    def _receive_troubled(self, routes: list[tuple[EmulatedDrive, Handler]], data: bytes) -> None:
         for drive, handler in routes:
             if self.trouble.hears(drive):
                 reply = handler(data, self.now_ns)
                 if reply is not None:
                     self._answer(drive, Reply(drive.reply_id, reply, drive.fd, self.now_ns))
 
-    def _answer(self, drive: DamiaoDrive, reply: Reply) -> None:
+    def _answer(self, drive: EmulatedDrive, reply: Reply) -> None:
         if not self.trouble.active:
             self.replies.append(reply)
             return
@@ -259,7 +237,7 @@ class Troubles:
             for drive in self._meant(trouble):
                 trouble.end(drive)
 
-    def hears(self, drive: DamiaoDrive) -> bool:
+    def hears(self, drive: EmulatedDrive) -> bool:
         """Return whether a frame reaches a drive."""
         for trouble in self._of(drive):
             if not trouble.hears(self._random):
@@ -268,7 +246,7 @@ class Troubles:
                 return False
         return True
 
-    def alter(self, drive: DamiaoDrive, reply: Reply) -> list[Reply]:
+    def alter(self, drive: EmulatedDrive, reply: Reply) -> list[Reply]:
         """Return what becomes of a reply."""
         replies = [reply]
         for trouble in self._of(drive):
@@ -284,26 +262,92 @@ class Troubles:
         if trouble.until_ns < FOREVER:
             self._bench.at(trouble.until_ns, lambda: self.remove(trouble))
 
-    def _of(self, drive: DamiaoDrive) -> list[Trouble]:
+    def _of(self, drive: EmulatedDrive) -> list[Trouble]:
         return [trouble for trouble in self.active if trouble.motor_id in (None, drive.id)]
 
-    def _meant(self, trouble: Trouble) -> list[DamiaoDrive]:
+    def _meant(self, trouble: Trouble) -> list[EmulatedDrive]:
         return [drive for drive in self._bench.drives if trouble.motor_id in (None, drive.id)]
 
 
-def _shafts(profile: RobotProfile, plant: Plant) -> list[tuple[str, Drive, Shaft]]:
-    """Return joint name, wiring and shaft of every motor, in the order of the plant's axes."""
-    found = []
+def _drives(bench: Bench, robot: Robot, fd: bool, seed: int) -> Iterator[EmulatedDrive]:
+    """Build the drives of a profile, in the order of the plant's axes, as an integrator leaves them."""
+    profile, plant = robot.profile, bench.plant
+    timeout_s = WATCHDOG_SHARE * profile.safety.drive_timeout_s
+    delay_ns = round(profile.twin.delay_s * 1e9)
+    noise = (profile.twin.noise_position, profile.twin.noise_velocity)
     for axis, joint in enumerate(profile.joints):
-        wiring = joint.drive
-        if wiring is not None:
-            gains = joint.gains
-            shaft = Shaft(plant, axis, wiring.sign * wiring.gear, wiring.offset, gains.kp, gains.kd)
-            found.append((joint.name, wiring, shaft))
+        wiring, gains = joint.drive, joint.gains
+        assert wiring is not None
+        scale = wiring.sign * wiring.gear
+        shaft = Shaft(plant, axis, scale, wiring.offset, gains.kp, gains.kd)
+        own_noise = (noise[0] * wiring.gear, noise[1] * wiring.gear)
+        if isinstance(wiring, wired.Cia402Drive):
+            yield _cia402(bench, joint, wiring, shaft, timeout_s, delay_ns, own_noise, seed + axis)
+        else:
+            yield _damiao(
+                bench, joint.name, wiring, shaft, ControlMode.MIT, timeout_s, fd, delay_ns, own_noise, seed + axis
+            )
     gripper = profile.gripper
-    if gripper and gripper.drive:
+    if gripper and isinstance(gripper.drive, wired.DamiaoDrive):
         finger = gripper.fingers[0]
-        scale = profile.gripper.motor_open / (finger.open - finger.closed) if profile.gripper else 1.0
+        scale = gripper.motor_open / (finger.open - finger.closed)
         shaft = Shaft(plant, plant.dof, scale, finger.closed, gripper.gains.kp, gripper.gains.kd)
-        found.append(("gripper", gripper.drive, shaft))
-    return found
+        yield _damiao(
+            bench,
+            "gripper",
+            gripper.drive,
+            shaft,
+            ControlMode.POS_FORCE,
+            timeout_s,
+            fd,
+            0,
+            (0.0, 0.0),
+            seed + plant.dof,
+        )
+
+
+def _damiao(
+    bench: Bench,
+    name: str,
+    wiring: wired.DamiaoDrive,
+    shaft: Shaft,
+    mode: ControlMode,
+    timeout_s: float,
+    fd: bool,
+    delay_ns: int,
+    noise: tuple[float, float],
+    seed: int,
+) -> DamiaoDrive:
+    timeout = round(timeout_s / TIMEOUT_UNIT_S)
+    memory = Memory(factory_values(wiring.motor, wiring.id, wiring.reply_id, mode, timeout, fd))
+    return DamiaoDrive(name, wiring.motor, memory, shaft, bench.refresh, bench.at, delay_ns, noise, seed)
+
+
+def _cia402(
+    bench: Bench,
+    joint: wired.Joint,
+    wiring: wired.Cia402Drive,
+    shaft: Shaft,
+    timeout_s: float,
+    delay_ns: int,
+    noise: tuple[float, float],
+    seed: int,
+) -> Cia402Drive:
+    square = wiring.gear**2
+    drive: Cia402Drive
+    drive = Cia402Drive(
+        joint.name,
+        wiring,
+        shaft,
+        (joint.gains.kp / square, joint.gains.kd / square),
+        joint.torque / wiring.gear,
+        timeout_s,
+        bench.refresh,
+        lambda arbitration_id, data: bench.say(drive, arbitration_id, data),
+        bench.at,
+        bench.now_ns,
+        delay_ns,
+        noise,
+        seed,
+    )
+    return drive

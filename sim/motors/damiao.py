@@ -5,7 +5,7 @@ Behaviour follows the vendor's manual and what openarm_can, axol, i2rt and pytho
 leave a question open, the least forgiving answer was taken.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from math import isfinite, pi
 from random import Random
@@ -13,32 +13,42 @@ from random import Random
 from robotctl.hal.can.damiao.codec import (
     KD_MAX,
     KP_MAX,
+    Feedback,
+    Offset,
     RegisterCommand,
     RegisterFrame,
     Special,
     Status,
+    decode_feedback,
     decode_pos_force,
     decode_pos_vel,
     decode_vel,
+    encode_feedback,
     encode_register,
+    is_feedback,
 )
+from robotctl.hal.can.damiao.faults import status_name
 from robotctl.hal.can.damiao.motors import Ranges
-from robotctl.hal.can.damiao.registers import CAN_BITRATES, ControlMode, Register, decode_value, encode_value
+from robotctl.hal.can.damiao.registers import (
+    CAN_BITRATES,
+    TIMEOUT_UNIT_S,
+    ControlMode,
+    Register,
+    decode_value,
+    encode_value,
+)
+from robotctl.sim.motors.drive import FOREVER, Defer, Handler, Reply
 from robotctl.sim.motors.memory import Memory, accepts
 from robotctl.sim.motors.servo import Servo
 from robotctl.sim.motors.shaft import Shaft
 from robotctl.sim.motors.thermal import Thermal
 
-FOREVER = 1 << 62
-"""A time that never comes, ns."""
-
 _TIMEOUT_UNIT_NS = 50_000
+_FD_NOMINAL = 1_000_000
+"""Arbitration rate of a drive that is set to CAN FD, bit/s: the faster one is its data phase's."""
 _U16 = 0xFFFF
 _U12 = 0xFFF
 _SPECIAL = 0xFFFFFFFF_FFFFFF00
-
-Defer = Callable[[int, Callable[[], None]], None]
-"""Takes a time in ns and what to do then."""
 
 
 class DamiaoDrive:
@@ -121,6 +131,29 @@ class DamiaoDrive:
         timeout = self.memory[Register.TIMEOUT]
         return self.fed_ns + int(timeout) * _TIMEOUT_UNIT_NS if timeout and self.enabled else FOREVER
 
+    @property
+    def is_faulty(self) -> bool:
+        return self.status > Status.ENABLED
+
+    @property
+    def cycles(self) -> int:
+        return self.memory.cycles
+
+    def told(self, status: object) -> str:
+        assert isinstance(status, int)
+        return status_name(status)
+
+    def routes(self, bitrate: int) -> Mapping[int, Handler]:
+        """Return what it does with commands in each mode; nothing without power, or at another bit rate."""
+        if not self.powered or bitrate != (_FD_NOMINAL if self.fd else self.bitrate):
+            return {}
+        return {
+            self.id + Offset.MIT: self.on_mit,
+            self.id + Offset.POS_VEL: self.on_pos_vel,
+            self.id + Offset.VEL: self.on_vel,
+            self.id + Offset.POS_FORCE: self.on_pos_force,
+        }
+
     # --- power, faults and time -------------------------------------------------------------------------------------
 
     def power_up(self) -> None:
@@ -142,9 +175,12 @@ class DamiaoDrive:
         self.memory.preset(register, value)
         self._adopt()
 
-    def fail(self, status: int) -> None:
-        """Report a fault from now on; it takes the drive out of enable mode and stays until it is cleared."""
-        self._leave(status)
+    def set_watchdog(self, seconds: float) -> None:
+        self.preset(Register.TIMEOUT, round(seconds / TIMEOUT_UNIT_S))
+
+    def fail(self, code: int | None = None) -> None:
+        """Report a status from now on, over-current if none is given; the drive is off until it is cleared."""
+        self._leave(Status.OVER_CURRENT if code is None else code)
 
     def supply(self, voltage: float) -> None:
         """Measure this at the supply, V; below register 0 it switches itself off, and cannot be cleared."""
@@ -268,6 +304,17 @@ class DamiaoDrive:
             v = min(max(v, 0), _U12)
             t = min(max(t, 0), _U12)
         return (self.status << 60 | p << 40 | v << 28 | t << 16 | self._tail | self.thermal.word).to_bytes(8, "big")
+
+    def shifted(self, reply: Reply, angle: float) -> Reply:
+        return self._retold(reply, lambda said: said._replace(position=said.position + angle))
+
+    def frozen(self, reply: Reply, angle: float) -> Reply:
+        return self._retold(reply, lambda said: said._replace(position=angle, velocity=0.0))
+
+    def _retold(self, reply: Reply, change: Callable[[Feedback], Feedback]) -> Reply:
+        if not is_feedback(reply.data, self.id):
+            return reply
+        return reply._replace(data=encode_feedback(change(decode_feedback(reply.data, self.ranges)), self.ranges))
 
     # --- inside -----------------------------------------------------------------------------------------------------
 

@@ -2,10 +2,13 @@
 
 from collections.abc import Callable
 
+from robotctl.hal.can.cia402.objects import Entry
 from robotctl.hal.can.damiao.registers import REGISTERS
 from robotctl.hal.errors import ConfigError
 from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.cia402 import Cia402Drive
 from robotctl.sim.motors.damiao import DamiaoDrive
+from robotctl.sim.motors.drive import EmulatedDrive
 from robotctl.sim.motors.memory import accepts
 from robotctl.sim.motors.trouble import (
     Corrupt,
@@ -44,10 +47,13 @@ _KINDS: dict[str, tuple[type[Trouble], str, Callable[[str], float]]] = {
 TROUBLE_FORM = (
     "KIND:MOTOR[:VALUE][@FROM[-UNTIL]], where MOTOR is a joint's name, an id or `all`, and FROM and UNTIL are seconds "
     f"from the start; KIND is one of {', '.join(_KINDS)}; VALUE is the probability of drop, unterminated, duplicate "
-    "and corrupt, the seconds of delay, the Nm of runaway, the volts of undervoltage, the rad of zero, the status of "
-    "fault"
+    "and corrupt, the seconds of delay, the Nm of runaway, the volts of undervoltage, the rad of zero, the "
+    "status (DAMIAO) or error code (CiA 402) of fault"
 )
-REGISTER_FORM = "MOTOR:REGISTER=VALUE, where MOTOR is a joint's name, an id or `all`, and REGISTER a number or a name"
+REGISTER_FORM = (
+    "MOTOR:REGISTER=VALUE, where MOTOR is a joint's name, an id or `all`, and REGISTER a number or a name, or the "
+    "INDEX or INDEX.SUB of an object of a CiA 402 drive"
+)
 
 
 def order_trouble(bench: Bench, order: str) -> None:
@@ -80,26 +86,42 @@ def order_trouble(bench: Bench, order: str) -> None:
 
 
 def order_register(bench: Bench, order: str) -> None:
-    """Set a register, in RAM and flash, as an order asks for.
+    """Set a register or an object, in RAM and in store, as an order asks for.
 
     Raises:
         ConfigError: if it does not have the form `REGISTER_FORM`, or no drive takes such a value.
     """
     motor, _, assignment = order.partition(":")
     name, _, text = assignment.partition("=")
-    names = {info.name.lower(): register for register, info in REGISTERS.items()}
-    try:
-        register = names[name.lower()] if name.lower() in names else int(name, 0)
-        value = float(int(text, 0)) if register in REGISTERS and REGISTERS[register].integer else float(text)
-    except ValueError as error:
-        raise ConfigError(f"register {order!r} is not understood: {error}", f"write {REGISTER_FORM}") from error
     for drive in _motors(bench, motor):
-        if register not in REGISTERS or (REGISTERS[register].writable and not accepts(register, value)):
-            raise ConfigError(f"register {order!r}: no drive has that", "see the vendor's list of registers")
-        drive.preset(register, value)
+        try:
+            if isinstance(drive, Cia402Drive):
+                drive.preset(_entry(drive, name), int(text, 0))
+            elif isinstance(drive, DamiaoDrive):
+                drive.preset(*_register(name, text))
+        except ValueError as error:
+            raise ConfigError(f"register {order!r} is not understood: {error}", f"write {REGISTER_FORM}") from error
+        except LookupError as error:
+            raise ConfigError(f"register {order!r}: no drive has that", "see the vendor's list of registers") from error
 
 
-def _motors(bench: Bench, word: str) -> list[DamiaoDrive]:
+def _register(name: str, text: str) -> tuple[int, float]:
+    """Return a register of a DAMIAO drive and its value; LookupError if it takes none such."""
+    names = {info.name.lower(): register for register, info in REGISTERS.items()}
+    register = names[name.lower()] if name.lower() in names else int(name, 0)
+    value = float(int(text, 0)) if register in REGISTERS and REGISTERS[register].integer else float(text)
+    if register not in REGISTERS or (REGISTERS[register].writable and not accepts(register, value)):
+        raise LookupError(register)
+    return register, value
+
+
+def _entry(drive: Cia402Drive, name: str) -> Entry:
+    """Return an object of a CiA 402 drive, by INDEX or INDEX.SUB; LookupError if it has none such."""
+    index, _, sub = name.partition(".")
+    return drive.dictionary.entries[int(index, 0), int(sub, 0) if sub else 0]
+
+
+def _motors(bench: Bench, word: str) -> list[EmulatedDrive]:
     if word == "all":
         return list(bench.drives)
     try:

@@ -24,7 +24,7 @@ def open_port(channel: str, robot: Robot, adapters: int = 1) -> Port:
     """
     wiring = robot.profile.can
     if wiring is None:
-        raise ConfigError(f"robot {robot.profile.name!r} has no CAN drives to emulate", "use panda or openarm")
+        raise ConfigError(f"robot {robot.profile.name!r} has no CAN drives to emulate", "use panda, openarm or xarm7")
     if channel == "slcan":
         return SlcanPort(adapters, wiring.bitrate)
     interface, _, where = channel.partition(":")

@@ -9,7 +9,7 @@ import can
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError
 from robotctl.sim.motors.bench import Bench
-from robotctl.sim.motors.damiao import DamiaoDrive
+from robotctl.sim.motors.drive import EmulatedDrive
 
 POLL_S = 0.0005
 """Longest wait for a frame before time is let pass."""
@@ -121,7 +121,7 @@ class Server:
         self.answered = 0
         self.lost = 0
         """Replies that did not leave: CAN FD on a classic channel, or a queue that was full."""
-        self.on_status: Callable[[DamiaoDrive, int, float], None] | None = None
+        self.on_status: Callable[[EmulatedDrive, object, float], None] | None = None
         """Called when a drive's status changes: the drive, its old status, seconds since it last heard a frame."""
         self.on_frame: Callable[[can.Message], None] | None = None
         """Called for every frame in either direction, with the drives' time of it."""
@@ -188,7 +188,7 @@ class Server:
             if self._port.carries_errors:
                 self._port.send(can.Message(arbitration_id=error.error_class, is_error_frame=True, data=error.data))
 
-    def _watch(self, report: Callable[[DamiaoDrive, int, float], None]) -> None:
+    def _watch(self, report: Callable[[EmulatedDrive, object, float], None]) -> None:
         for index, drive in enumerate(self._bench.drives):
             if drive.status != self._statuses[index]:
                 before, self._statuses[index] = self._statuses[index], drive.status

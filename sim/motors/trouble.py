@@ -1,24 +1,11 @@
 """Trouble to order, seeded and deterministic: what goes wrong with frames on the wire, and with the drives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from random import Random
-from typing import NamedTuple
 
-from robotctl.hal.can.damiao.codec import Status, decode_feedback, encode_feedback, is_feedback
-from robotctl.hal.can.damiao.motors import Ranges
-from robotctl.sim.motors.damiao import FOREVER, DamiaoDrive
+from robotctl.sim.motors.drive import FOREVER, EmulatedDrive, Reply
 from robotctl.sim.motors.memory import NOMINAL_VOLTAGE
-
-
-class Reply(NamedTuple):
-    """A frame from a drive."""
-
-    arbitration_id: int
-    data: bytes
-    fd: bool
-    stamp_ns: int
-    """When it appears on the wire."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +13,7 @@ class Trouble:
     """Something that is wrong with one motor, or with all, for some time."""
 
     motor_id: int | None = None
-    """ESC_ID; None for every motor."""
+    """ESC_ID or node id; None for every motor."""
     from_ns: int = 0
     until_ns: int = FOREVER
 
@@ -35,10 +22,10 @@ class Trouble:
         """Whether frames that it swallows are broken on the wire, so that the host's controller reports them."""
         return False
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         """Act on a drive when the time comes."""
 
-    def end(self, drive: DamiaoDrive) -> None:
+    def end(self, drive: EmulatedDrive) -> None:
         """Undo it."""
 
     def hears(self, random: Random) -> bool:
@@ -134,10 +121,10 @@ class Corrupt(Trouble):
 class Stuck(Trouble):
     """The joint has seized up."""
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         drive.shaft.jam(jammed=True)
 
-    def end(self, drive: DamiaoDrive) -> None:
+    def end(self, drive: EmulatedDrive) -> None:
         drive.shaft.jam(jammed=False)
 
 
@@ -148,10 +135,10 @@ class Runaway(Trouble):
     torque: float = 1.0
     """Nm of the motor"""
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         drive.shaft.run_away(self.torque)
 
-    def end(self, drive: DamiaoDrive) -> None:
+    def end(self, drive: EmulatedDrive) -> None:
         drive.shaft.run_away(None)
 
 
@@ -159,10 +146,10 @@ class Runaway(Trouble):
 class PowerCut(Trouble):
     """The supply fails; when it comes back, the drive starts from its flash, disabled."""
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         drive.power_down()
 
-    def end(self, drive: DamiaoDrive) -> None:
+    def end(self, drive: EmulatedDrive) -> None:
         drive.power_up()
 
 
@@ -170,9 +157,10 @@ class PowerCut(Trouble):
 class Failure(Trouble):
     """The drive reports a fault and switches itself off. It can be cleared at once."""
 
-    status: int = Status.OVER_CURRENT
+    status: int | None = None
+    """A DAMIAO status or a CiA 402 error code; None for over-current."""
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         drive.fail(self.status)
 
 
@@ -182,10 +170,10 @@ class UnderVoltage(Trouble):
 
     voltage: float = 11.0
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         drive.supply(self.voltage)
 
-    def end(self, drive: DamiaoDrive) -> None:
+    def end(self, drive: EmulatedDrive) -> None:
         drive.supply(NOMINAL_VOLTAGE)
 
 
@@ -196,10 +184,10 @@ class WrongZero(Trouble):
     offset: float = 1.0
     """By how much it reports too much, rad of the motor."""
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         drive.shift_zero(self.offset)
 
-    def end(self, drive: DamiaoDrive) -> None:
+    def end(self, drive: EmulatedDrive) -> None:
         drive.shift_zero(-self.offset)
 
 
@@ -209,18 +197,11 @@ class Misreport(Trouble):
 
     offset: float = 1.0
     """rad of the motor"""
-    ranges: Ranges
-    """The drive's."""
+    tell: Callable[[Reply, float], Reply]
+    """The drive's `shifted`."""
 
     def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
-        return [self._shift(reply) for reply in replies]
-
-    def _shift(self, reply: Reply) -> Reply:
-        if self.motor_id is None or not is_feedback(reply.data, self.motor_id):
-            return reply
-        feedback = decode_feedback(reply.data, self.ranges)
-        shifted = feedback._replace(position=feedback.position + self.offset)
-        return reply._replace(data=encode_feedback(shifted, self.ranges))
+        return [self.tell(reply, self.offset) for reply in replies]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,17 +210,11 @@ class Frozen(Trouble):
 
     angle: float = 0.0
     """rad of the motor"""
-    ranges: Ranges
-    """The drive's."""
+    tell: Callable[[Reply, float], Reply]
+    """The drive's `frozen`."""
 
     def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
-        return [self._freeze(reply) for reply in replies]
-
-    def _freeze(self, reply: Reply) -> Reply:
-        if self.motor_id is None or not is_feedback(reply.data, self.motor_id):
-            return reply
-        feedback = decode_feedback(reply.data, self.ranges)
-        return reply._replace(data=encode_feedback(feedback._replace(position=self.angle, velocity=0.0), self.ranges))
+        return [self.tell(reply, self.angle) for reply in replies]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,8 +233,8 @@ class Weak(Trouble):
 
     part: float = 0.5
 
-    def begin(self, drive: DamiaoDrive) -> None:
+    def begin(self, drive: EmulatedDrive) -> None:
         drive.shaft.weaken(self.part)
 
-    def end(self, drive: DamiaoDrive) -> None:
+    def end(self, drive: EmulatedDrive) -> None:
         drive.shaft.weaken(1.0)

@@ -72,3 +72,26 @@ def test_a_channel_that_drives_an_arm_is_left_alone(invoke, verb):
         result = invoke(verb, "--channel", "slcan:/dev/nosuch")
     assert result.exit_code == 4
     assert "in use by another robotctl" in result.output
+
+
+def test_scan_of_canopen_nodes(invoke, tmp_path):
+    report = tmp_path / "scan.json"
+    result = invoke(scan, "--robot", "xarm7", "--last", "9", "--json", str(report))
+    assert result.exit_code == 0
+    assert "CANopen nodes on emulated" in result.output
+    found = json.loads(report.read_text())
+    assert found["motors"] == []
+    assert [node["id"] for node in found["nodes"]] == list(range(1, 8))
+    assert {(node["profile"], node["watchdog_s"], node["status"]) for node in found["nodes"]} == {
+        (402, 0.08, "SWITCH ON DISABLED")
+    }
+
+
+def test_doctor_reads_canopen_drives_back(invoke, tmp_path):
+    report = tmp_path / "doctor.json"
+    result = invoke(doctor, "--robot", "xarm7", "--channel", "emulated", "--json", str(report))
+    findings = {entry["name"]: entry for entry in json.loads(report.read_text())["findings"]}
+    assert "load the bus by 68 %" in findings["bus load"]["text"]
+    assert findings["joint7 (node 7)"]["level"] == "ok"
+    drives = [entry for entry in findings.values() if entry["area"] in ("drives", "bus")]
+    assert {entry["level"] for entry in drives} == {"ok"}, result.output

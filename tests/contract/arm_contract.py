@@ -16,7 +16,7 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, GripperSample, Sample, Vector
 from robotctl.sim.plant import Plant
 
-BLIND_TICKS = 30
+BLIND_S = 0.06
 """Without a command: shorter than any drive's watchdog."""
 
 
@@ -67,6 +67,11 @@ class Bench:
 
     def seconds(self, seconds: float) -> int:
         return round(seconds * self.robot.profile.servo_hz)
+
+    @property
+    def blind(self) -> int:
+        """Ticks that may pass without a command."""
+        return self.seconds(BLIND_S)
 
     def drift(self, pose: Vector) -> float:
         return float(np.abs(self.arm.truth().position - pose).max())
@@ -152,7 +157,7 @@ class ArmContract(_Contract):
 
     def test_enabled_it_holds_the_measured_pose(self, bench: Bench):
         pose = bench.enable()
-        for _ in range(BLIND_TICKS):  # nothing but what `enable` left the drives with
+        for _ in range(bench.blind):  # nothing but what `enable` left the drives with
             assert bench.tick().enabled
         assert bench.drift(pose) < 5e-3
         bench.tick(bench.seconds(0.5), lambda _: bench.track(pose))
@@ -162,7 +167,7 @@ class ArmContract(_Contract):
         pose = bench.enable()
         bench.tick(10, lambda _: bench.track(pose))
         bench.arm.enable()
-        assert bench.tick(BLIND_TICKS).enabled
+        assert bench.tick(bench.blind).enabled
         assert bench.drift(pose) < 5e-3
 
     def test_holding_ends_a_motion(self, bench: Bench):
@@ -170,7 +175,7 @@ class ArmContract(_Contract):
         bench.set_in_motion()
         where = bench.arm.truth().position
         assert bench.arm.hold().altered == ""
-        bench.tick(BLIND_TICKS)
+        bench.tick(bench.blind)
         assert bench.drift(where) < 0.1
         assert np.abs(bench.arm.truth().velocity[0]) < 0.2
 
@@ -206,7 +211,7 @@ class ArmContract(_Contract):
         gravity = bench.kinematics.gravity(bench.home)
         bench.arm.write(Command(CommandMode.TRACK, bench.home + 0.5, bench.rest + 1.0, gravity))
         bench.arm.enable()
-        bench.tick(BLIND_TICKS)
+        bench.tick(bench.blind)
         assert bench.drift(bench.home) < 5e-3
 
     def test_effort_alone_balances_gravity_or_does_not(self, bench: Bench):
@@ -239,14 +244,14 @@ class ArmContract(_Contract):
         values[2] = bad
         sent = bench.arm.write(bench.track(pose)._replace(**{field: values}))
         assert sent.altered
-        bench.tick(BLIND_TICKS)
+        bench.tick(bench.blind)
         assert bench.drift(pose) < 5e-3
 
     def test_a_command_of_another_shape_is_kept_back(self, bench: Bench):
         pose = bench.enable()
         short = np.zeros(bench.robot.dof - 1)
         assert bench.arm.write(Command(CommandMode.TRACK, short, short, short)).altered
-        bench.tick(BLIND_TICKS)
+        bench.tick(bench.blind)
         assert bench.drift(pose) < 5e-3
 
     # -- the end ----------------------------------------------------------------------------------------------------
@@ -287,7 +292,7 @@ class ArmContract(_Contract):
         pose = bench.enable_again()
         assert pose == pytest.approx(moved, abs=5e-3)
         worst = 0.0
-        for _ in range(BLIND_TICKS):
+        for _ in range(bench.blind):
             bench.tick()
             worst = max(worst, bench.drift(pose))
         assert worst < 8e-3

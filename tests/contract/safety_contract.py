@@ -166,7 +166,10 @@ class SafetyContract:
     BUGS: ClassVar[dict[str, tuple[str, Callable[[Robot, Command], Command]]]] = {
         "velocity": ("P1", lambda robot, command: command._replace(velocity=1.05 * robot.limits.velocity)),
         "limits": ("P2", lambda robot, command: shift(command, position=robot.limits.upper - command.position + 0.01)),
-        "acceleration": ("P6", lambda robot, command: shift(command, velocity=0.01 * robot.limits.acceleration)),
+        "acceleration": (
+            "P6",
+            lambda robot, command: shift(command, velocity=5e-9 * robot.period_ns * robot.limits.acceleration),
+        ),
         "torque": ("P7", lambda robot, command: command._replace(effort=1.01 * robot.limits.torque)),
         "jump": ("P1", lambda robot, command: shift(command, position=0.05 * robot.limits.velocity)),
         "mode": ("P7", lambda robot, command: Command(CommandMode.EFFORT, *command[1:3], 0.2 * robot.limits.torque)),

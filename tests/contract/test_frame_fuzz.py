@@ -8,13 +8,27 @@ import pytest
 
 from robotctl.control.session import LockstepSession
 from robotctl.hal.can.damiao.codec import BROADCAST_ID, Offset
-from robotctl.hal.robot import load_robot
+from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.machine import State
 from robotctl.safety.target import JointVelocity
 from robotctl.sim.motors.trouble import Reply
 
 FRAMES = 1_000_000
 PER_TICK = 250
+
+
+def name_of_protocol(robot: Robot) -> str:
+    return robot.profile.joints[0].drive.protocol
+
+
+def is_strange(robot: Robot, arbitration_id: int, data: bytes) -> bool:
+    """Return whether a frame is not what a host sends: of another length, or one that clears, sets a zero, stops."""
+    if name_of_protocol(robot) == "cia402":
+        word = data[0] if arbitration_id & 0x780 == 0x200 else 0
+        return len(data) != {0x000: 2, 0x200: 7, 0x300: 6, 0x600: 8, 0x700: 1, 0x080: 0}[
+            arbitration_id & 0x780
+        ] or word not in (0x00, 0x06, 0x07, 0x0F)
+    return len(data) != 8 or (data[:7] == b"\xff" * 7 and data[7] not in (0xFC, 0xFD))
 
 
 class Fuzz:
@@ -33,14 +47,17 @@ class Fuzz:
         self.session.__enter__()
         bus = self.session._rig.arm._channel.bus
         self.bench = bus.bench
-        motors = [drive.id for drive in self.bench.drives]
-        self.replies = [drive.reply_id for drive in self.bench.drives]
-        known = {*motors, BROADCAST_ID, motors[-1] + Offset.POS_FORCE}
+        motors = self.bench.drives
+        if name_of_protocol(self.robot) == "cia402":
+            self.replies = [base + drive.id for drive in motors for base in (0x080, 0x180, 0x280, 0x700)]
+            known = {base + drive.id for drive in motors for base in (0x200, 0x300, 0x600)} | {0x000, 0x080, 0x77F}
+        else:
+            self.replies = [drive.reply_id for drive in motors]
+            known = {*(drive.id for drive in motors), BROADCAST_ID, motors[-1].id + Offset.POS_FORCE}
         receive = bus._receive
 
         def look(arbitration_id: int, data: bytes) -> None:
-            special = bytes(data[:7]) == b"\xff" * 7 and data[7] not in (0xFC, 0xFD)
-            if arbitration_id not in known or len(data) != 8 or special:
+            if arbitration_id not in known or is_strange(self.robot, arbitration_id, bytes(data)):
                 self.strange.append((arbitration_id, bytes(data)))
             receive(arbitration_id, data)
             self.heard.extend(list(self.bench.replies)[-1:])
@@ -67,7 +84,7 @@ class Fuzz:
         return Reply(arbitration_id, self.random.randbytes(length), self.random.random() < 0.5, self.bench.now_ns)
 
 
-@pytest.mark.parametrize("name", ["panda", "openarm"])
+@pytest.mark.parametrize("name", ["panda", "openarm", "xarm7"])
 def test_frames_of_others_change_nothing(name: str) -> None:
     with Fuzz(name, 1) as fuzz:
         others = sorted(set(range(0x800)) - set(fuzz.replies))
@@ -79,7 +96,7 @@ def test_frames_of_others_change_nothing(name: str) -> None:
         assert sum(fuzz.session.judge.violations.values()) == 0
 
 
-@pytest.mark.parametrize("name", ["panda", "openarm"])
+@pytest.mark.parametrize("name", ["panda", "openarm", "xarm7"])
 def test_frames_in_our_drives_names_stop_the_arm_and_no_more(name: str) -> None:
     with Fuzz(name, 2) as fuzz:
         while fuzz.injected < FRAMES // 4:

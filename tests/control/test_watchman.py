@@ -104,8 +104,8 @@ class Scene:
             self.frames.append((number, bytes(data))),
             receive(number, data),
         )
-        monkeypatch.setattr("robotctl.hal.can.damiao.arm.is_shared", lambda _: True)
-        monkeypatch.setattr("robotctl.hal.can.damiao.arm.reopen_channel", lambda *_: self.channel)
+        monkeypatch.setattr("robotctl.hal.can.arm.is_shared", lambda _: True)
+        monkeypatch.setattr("robotctl.hal.can.arm.reopen_channel", lambda *_: self.channel)
         self.clock = self.session.clock
         self.rig = open_backend("can", self.robot, self.clock, "emulated")
         self.onset = self.clock.now_ns()
@@ -244,7 +244,7 @@ def test_a_channel_that_cannot_be_opened_is_told(openarm: Scene, monkeypatch: py
     def refuse(*_: object) -> None:
         raise BusError("the adapter is gone")
 
-    monkeypatch.setattr("robotctl.hal.can.damiao.arm.reopen_channel", refuse)
+    monkeypatch.setattr("robotctl.hal.can.arm.reopen_channel", refuse)
     openarm.rescue()
     openarm.session.poll()
     trip = openarm.session.trips[-1]

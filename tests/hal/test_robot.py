@@ -74,14 +74,18 @@ def test_arrays_are_read_only(panda: Robot) -> None:
         (
             "brakes: true",
             "brakes: true\nkeep_out: [{kind: box, name: a, centre: [0, 0, 0], half: [1, 0, 1]}]",
-            r"keep_out.0.box.half.1: .*greater than 0",
+            r"keep_out.0.half.1: .*greater than 0",
         ),
         (
             "brakes: true",
             "brakes: true\nkeep_out: [{kind: plane, name: sphere, point: [0, 0, 0], normal: [0, 0, 1]}]",
             r"keep_out: more than one region is called \['sphere'\]",
         ),
-        ("brakes: true", "brakes: true\nkeep_out: [{kind: cone, name: a}]", r"keep_out.0: .*'cone'"),
+        (
+            "brakes: true",
+            "brakes: true\nkeep_out: [{kind: cone, name: a}]",
+            r"keep_out.0.kind: must be one of 'plane', 'box'",
+        ),
         ("title:", "title", r"panda.yaml:\d+: not valid YAML"),
         ("title: Franka Emika Panda (7 joints; CAN drives emulated only)\n", "", r"title: missing"),
     ],

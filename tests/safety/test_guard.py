@@ -94,6 +94,7 @@ EXPECTED = {
     Kind.READ: set(State) - {State.OFF},
     Kind.DISABLE: set(State) - {State.OFF},
     Kind.MODE: {State.SILENT},
+    Kind.START: {State.SILENT, State.ARMED},
     Kind.ENABLE: {State.ARMED},
     Kind.TRACK: {State.ARMED, State.RUN, State.RESET, State.STOPPING, State.HOLD},
     Kind.TORQUE: {State.RUN},
@@ -105,9 +106,18 @@ EXPECTED = {
 }
 
 
-@pytest.mark.parametrize(("kind", "state"), list(itertools.product(Kind, State)))
+def test_the_list_knows_every_kind():
+    assert {kind: set(PERMITTED[kind]) for kind in Kind} == EXPECTED
+
+
+@pytest.mark.parametrize("state", State)
+def test_a_canopen_drive_may_be_started_before_it_is_enabled(state):
+    refused = Bench(state, load_robot("xarm7")).frames((0x000, b"\x01\x01"))
+    assert refused is (None if state in EXPECTED[Kind.START] else Protection.FRAMES)
+
+
+@pytest.mark.parametrize(("kind", "state"), list(itertools.product(FRAMES, State)))
 def test_every_kind_of_frame_in_every_state(kind, state):
-    assert set(PERMITTED[kind]) == EXPECTED[kind]
     refused = Bench(state).frames(FRAMES[kind])
     assert refused is (None if state in EXPECTED[kind] else Protection.FRAMES)
 

@@ -77,7 +77,15 @@ def test_it_tells_as_it_goes(panda: Robot) -> None:
 
 @pytest.mark.parametrize(
     ("robot", "backend"),
-    [("panda", "sim"), ("panda", "can"), ("openarm", "sim"), ("openarm", "can"), ("kinova", "sim"), ("xarm7", "sim")],
+    [
+        ("panda", "sim"),
+        ("panda", "can"),
+        ("openarm", "sim"),
+        ("openarm", "can"),
+        ("kinova", "sim"),
+        ("xarm7", "sim"),
+        ("xarm7", "can"),
+    ],
 )
 def test_every_protection_has_a_scenario(robot: str, backend: str) -> None:
     found = scenarios(load_robot(robot), backend)

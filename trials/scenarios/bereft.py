@@ -56,7 +56,7 @@ def _off_by_themselves(emulator: Emulator, robot: Robot, trial: Trial) -> None:
 
 def _strike(emulator: Emulator, robot: Robot, backend: str, seed: int, kill: Callable[[Live], None]) -> bool:
     """Bring an arm on the emulator under way, and kill; return whether it came so far."""
-    overrides = (f"servo_hz={CLASSIC_HZ}",)  # the adapter carries classic CAN
+    overrides = (f"servo_hz={min(CLASSIC_HZ, robot.profile.servo_hz)}",)  # the adapter carries classic CAN
     slow = load_robot(str(robot.source), overrides)
     struck = False
     served = under_way(slow, backend, seed, lambda: emulator.channel, overrides)
@@ -87,7 +87,7 @@ def _bereft_scenario(
         for attempt in range(ATTEMPTS):
             trial = Trial()
             with tempfile.TemporaryDirectory() as folder:
-                emulator = Emulator(Path(folder), str(robot.source), robot.dof, robot.profile.safety.drive_timeout_s)
+                emulator = Emulator(Path(folder), robot, robot.profile.safety.drive_timeout_s)
                 if not _strike(emulator, robot, backend, seed + 100 * attempt, kill):
                     trial.require(False, "the machine was too busy")
                     continue

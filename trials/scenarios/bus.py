@@ -8,7 +8,6 @@ from typing import Any
 import can
 import numpy as np
 
-from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S, Register
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Fault, Sample
 from robotctl.safety.trip import Category, Protection
@@ -16,7 +15,7 @@ from robotctl.sim.motors import trouble as wire
 from robotctl.sim.trouble import Misread, NoWatchdog, Reject, Report, Trouble
 from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
-from robotctl.trials.faults import Planted, between, misread, on_wire
+from robotctl.trials.faults import Planted, between, misread, on_canopen, on_wire
 from robotctl.trials.orphans import orphan_scenario, without_bus
 from robotctl.trials.refusals import refusal_scenario
 from robotctl.trials.scenario import Scenario
@@ -41,7 +40,7 @@ def _timeout_of(seconds: float) -> Callable[[Robot, str, int], None]:
             bench.arm.troubles.append(NoWatchdog(name))
         else:
             bench.arm.connect()
-            bench.motors.drive(name).preset(Register.TIMEOUT, round(seconds / TIMEOUT_UNIT_S))
+            bench.motors.drive(name).set_watchdog(seconds)
         with bench:
             pass
 
@@ -158,8 +157,8 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     on_bus = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF, within_s=_UNDELIVERED_TICKS * period)
     # For as long as nothing leaves, the drives go on as they were told last.
     coasting = replace(on_bus, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position", "velocity"}))
-    # Drives that hear nothing any more go off by their own watchdogs, with a fault.
-    unheard = replace(on_bus, clears=Clears.POWER).losing_torque(robot)
+    # Drives that hear nothing any more go off by their own watchdogs; DAMIAO's with a fault.
+    unheard = replace(on_bus, clears=Clears.ACK if on_canopen(robot) else Clears.POWER).losing_torque(robot)
     senseless = Expected(
         protection=Protection.RECEIVE, category=Category.BRAKE_OFF, within_s=safety.rejected_frames * period
     )

@@ -5,9 +5,12 @@ from collections.abc import Callable
 import numpy as np
 
 from robotctl.control.operator import Verb
-from robotctl.hal.can.damiao.arm import DamiaoArm
+from robotctl.hal.can.arm import CanArm
+from robotctl.hal.can.cia402.codec import Mode, Service, Setpoint, encode_setpoint
+from robotctl.hal.can.cia402.machine import Word
 from robotctl.hal.can.damiao.codec import Special, encode_special
 from robotctl.hal.errors import HardwareError
+from robotctl.hal.profile import Cia402Drive
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, Sent
 from robotctl.safety.trip import Category, Protection
@@ -19,6 +22,8 @@ from robotctl.trials.policies import against_limit, before_limit, velocities
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.stops import Expected, Start, running, stop_scenario
 
+_HOME_OFFSET = bytes((0x23, 0x7C, 0x60, 0, 1, 0, 0, 0))
+"""SDO request that writes object 0x607C."""
 _OVER = 1.02
 """Times a cap: just enough for what the wire rounds."""
 
@@ -100,13 +105,23 @@ def _stray(identifier: int, data: bytes) -> Callable[[Bench], Planted]:
 
     def plant(bench: Bench) -> Planted:
         arm = bench.arm.arm
-        assert isinstance(arm, DamiaoArm)
+        assert isinstance(arm, CanArm)
         transport = arm._require_open()
         before = transport.withheld
         transport.send(identifier, data)
         return Planted(lambda: None, lambda: transport.withheld > before)
 
     return plant
+
+
+def _forbidden(robot: Robot) -> tuple[tuple[int, bytes], tuple[int, bytes]]:
+    """Return the frames (id, data) that would set the zero of the first drive, and clear its fault."""
+    drive = robot.profile.joints[0].drive
+    assert drive is not None
+    if isinstance(drive, Cia402Drive):
+        reset = encode_setpoint(Setpoint(Word.FAULT_RESET, Mode.POSITION, 0))
+        return (Service.SDO + drive.id, _HOME_OFFSET), (Service.RPDO1 + drive.id, reset)
+    return (drive.id, encode_special(Special.SET_ZERO)), (drive.id, encode_special(Special.CLEAR_ERROR))
 
 
 def _enabled_too_early(bench: Bench) -> Planted:
@@ -189,21 +204,10 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         ),
     ]
     if backend == "can":
-        joint = robot.profile.joints[0].drive
-        assert joint is not None
+        zero, clearing = _forbidden(robot)
         found += [
             bug(Protection.FRAMES, "foreign id", "a frame with an id that is not on the list", _stray(0x123, bytes(8))),
-            bug(
-                Protection.FRAMES,
-                "zero under way",
-                "a frame that sets a drive's zero",
-                _stray(joint.id, encode_special(Special.SET_ZERO)),
-            ),
-            bug(
-                Protection.FRAMES,
-                "fault cleared under way",
-                "a frame that clears a drive's fault",
-                _stray(joint.id, encode_special(Special.CLEAR_ERROR)),
-            ),
+            bug(Protection.FRAMES, "zero under way", "a frame that sets a drive's zero", _stray(*zero)),
+            bug(Protection.FRAMES, "fault cleared under way", "a frame that clears a drive's fault", _stray(*clearing)),
         ]
     return found

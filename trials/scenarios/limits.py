@@ -11,13 +11,15 @@ _COASTING = frozenset({"position"})
 """While a tick is late, the drives go on as they were told: more than the margins of a loop in time are made for."""
 _OFTEN_LATE = 0.15
 _LATEST = 2.0
-"""Servo periods."""
+"""Servo periods, as long as that is ..."""
+_LATEST_NS = 6_000_000
+"""... no more than what the invariants are promised for."""
 
 
 def jitter(bench: Bench) -> float:
     """Return a lateness for the next tick: intervals between 0.5 and 3 servo periods, never late twice in a row."""
     if bench.loop.lateness_ns < bench.robot.period_ns and bench.random.random() < _OFTEN_LATE:
-        return float(bench.random.uniform(1.0, _LATEST))
+        return float(bench.random.uniform(1.0, max(1.0, min(_LATEST, _LATEST_NS / bench.robot.period_ns))))
     return float(bench.random.uniform(0.0, 0.5))
 
 

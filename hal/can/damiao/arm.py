@@ -9,10 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from robotctl.hal.arm import Arm, Inspector
-from robotctl.hal.can.channel import Channel, is_shared, open_channel, reopen_channel
+from robotctl.hal.can.arm import CanArm, bus_faults
 from robotctl.hal.can.damiao.codec import KD_MAX, KP_MAX, Special, Status
-from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, DrivesError, Identity, raise_problems
+from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, Identity
 from robotctl.hal.can.damiao.faults import fault_of, status_name
 from robotctl.hal.can.damiao.gripper import DamiaoGripper
 from robotctl.hal.can.damiao.motors import MOTORS
@@ -20,14 +19,13 @@ from robotctl.hal.can.damiao.power import clear_faults, not_ready, switch_off
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.damiao.replay import describe
 from robotctl.hal.can.damiao.verification import Eavesdropper, Expected, verify_drive
-from robotctl.hal.can.tap import Tap
+from robotctl.hal.can.problems import DrivesError, raise_problems
 from robotctl.hal.can.transport import Transport, route_key
-from robotctl.hal.clock import Clock, VirtualClock
+from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError, DriveError, HardwareError
-from robotctl.hal.profile import CanBus
-from robotctl.hal.profile import Drive as DriveProfile
+from robotctl.hal.profile import DamiaoDrive as DriveProfile
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Truth, Vector, frozen
+from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Vector, frozen
 
 _POLL_PERIOD_NS = 3_500_000
 """Between two requests for feedback while the drives are off; every second tick at 500 Hz, 40 % load on FD."""
@@ -35,22 +33,9 @@ _POLL_PERIOD_NS = 3_500_000
 _LEAST_DAMPING = 0.5
 """Nms/rad of the motor in DAMP, where a profile's kd is smaller: damping has to stop an arm without brakes."""
 
-_BUS_FAULTS = {
-    "bus-off": Fault(
-        "bus", 0x40, "BUS_OFF", "the controller left the bus after too many errors; check cable and termination"
-    ),
-    "passive": Fault(
-        "bus", 0x20, "ERROR_PASSIVE", "the controller sees too many errors; check cable, termination and bit rates"
-    ),
-}
-"""What the states of a controller in trouble mean to a person."""
 
-
-class DamiaoArm(Arm):
-    """Fulfils `Arm` on a CAN channel, which is opened by `connect` and not before.
-
-    `warnings` holds what bring-up put right, `identities` what the drives said of themselves, by joint.
-    """
+class DamiaoArm(CanArm):
+    """Fulfils `Arm` on a CAN channel. `identities` holds what the drives said of themselves, by joint."""
 
     def __init__(self, robot: Robot, clock: Clock, channel: str) -> None:
         """Prepare. Opens and sends nothing.
@@ -58,23 +43,15 @@ class DamiaoArm(Arm):
         Raises:
             ConfigError: if the profile has no CAN drives, or asks for what the wire cannot carry.
         """
+        super().__init__(robot, clock, channel)
         profile = robot.profile
-        if profile.can is None:
-            raise ConfigError(
-                f"{robot.source}: the robot has no `can` section", "use --backend sim, or describe its drives"
-            )
-        self.warnings: list[str] = []
         self.identities: dict[str, Identity] = {}
-        self._inspector: Inspector | None = None
-        self._tap: Tap | None = None
         self.gripper: DamiaoGripper | None = None
-        self._robot = robot
-        self._clock = clock
-        self._name = channel
-        self._can: CanBus = profile.can
-        self._specs = [(joint.name, joint.drive) for joint in profile.joints if joint.drive is not None]
-        self._expected = [self._expect(joint.name, joint.drive) for joint in profile.joints if joint.drive is not None]
-        if profile.gripper and profile.gripper.drive:
+        self._specs = [(joint.name, joint.drive) for joint in profile.joints if isinstance(joint.drive, DriveProfile)]
+        self._expected = [
+            self._expect(joint.name, joint.drive) for joint in profile.joints if isinstance(joint.drive, DriveProfile)
+        ]
+        if profile.gripper and isinstance(profile.gripper.drive, DriveProfile):
             self.gripper = DamiaoGripper(profile.gripper, clock)
             drive = profile.gripper.drive
             # The gripper's angle is mapped by motor_open, so its drive stays in the motor's own radians.
@@ -83,52 +60,17 @@ class DamiaoArm(Arm):
                 Expected(drive.motor, ControlMode.POS_FORCE, profile.safety.drive_timeout_s, None, 2.0 * np.pi)
             )
         _check(robot, self._specs)
-        self._channel: Channel | None = None
-        self._transport: Transport | None = None
         self._drives: list[Drive] = []
         self._joints: list[Drive] = []
         self._zeros = frozen([0.0] * robot.dof)
         self._still = [0.0] * robot.dof
         self._feed_forward = self._zeros
         self._gains: dict[CommandMode, list[int]] = {}
-        self._verified = False
-        self._enabled = False
         self._polled_ns = 0
-
-    def inspect_with(self, inspector: Inspector) -> None:
-        self._inspector = inspector
-        if self._transport is not None:
-            self._transport.inspector = inspector.frames
-
-    def record_frames(self, tap: Tap) -> None:
-        self._tap = tap
-        if self._transport is not None:
-            self._transport.tap = tap
-
-    @property
-    def channel(self) -> Channel | None:
-        """The open channel; None before `connect` and after `close`."""
-        return self._channel
 
     # --- life -------------------------------------------------------------------------------------------------------
 
-    def connect(self) -> None:
-        if not self._open:
-            self._use(open_channel(self._name, self._robot, self._clock))
-
-    def _use(self, channel: Channel) -> None:
-        if isinstance(self._clock, VirtualClock) and not channel.simulated:
-            channel.bus.shutdown()
-            raise ConfigError(
-                f"the drives behind {self._name!r} live in real time, which lockstep outruns: they would move too fast",
-                "leave out --fast, or use --channel emulated",
-            )
-        transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
-        if self._inspector is not None:
-            transport.inspector = self._inspector.frames
-        transport.tap = self._tap
-        self._channel, self._transport = channel, transport
-        self._verified = self._enabled = False
+    def _attach(self, transport: Transport) -> None:
         self._drives = [
             Drive(
                 name,
@@ -206,19 +148,11 @@ class DamiaoArm(Arm):
             raise
         self._enabled = True
 
-    def take_over(self, command: Command) -> None:
-        """Take drives that another process had enabled; see `Arm.take_over`. Their ranges are the profile's motors'.
+    def _take_over(self, command: Command) -> None:
+        """Return once every drive has answered, or after 20 ms. Their ranges are taken to be the profile's motors'.
 
-        Returns once every drive has answered, or after 20 ms. The gripper, if it has, holds its opening.
-
-        Raises:
-            HardwareError: on channels whose drives live in the process that opened them.
-            BusError: if the channel cannot be opened.
+        The gripper, if it has answered, holds its opening.
         """
-        if not is_shared(self._name):
-            super().take_over(command)
-        self._use(reopen_channel(self._name, self._robot, self._clock))
-        self._verified = self._enabled = True
         transport, drives, angles = self._require_open(), self._drives, command.position.tolist()
         for drive, angle in zip(self._joints, angles, strict=True):
             drive.position = angle
@@ -250,8 +184,7 @@ class DamiaoArm(Arm):
         for drive in self._drives:
             if drive.status > 1:
                 faults += (fault_of(drive.name, drive.status),)
-        if transport.state in _BUS_FAULTS:
-            faults += (_BUS_FAULTS[transport.state],)
+        faults += bus_faults(transport)
         return Sample(
             now,
             np.array([drive.position for drive in joints]),
@@ -349,36 +282,17 @@ class DamiaoArm(Arm):
         clear_faults(self._drives)
 
     def close(self) -> None:
-        self._verified = self._enabled = False
         if self.gripper:
             self.gripper.release()
-        if self._transport is not None:
-            self._transport.close()
-        self._channel = None
+        super().close()
 
     # --- about ------------------------------------------------------------------------------------------------------
 
-    def truth(self) -> Truth | None:
-        channel = self._channel
-        return channel.truth() if channel is not None and channel.truth is not None else None
-
     def bus_statistics(self) -> dict[str, object] | None:
         """Return the counters since `connect`; they outlive `close`. `missed_by_joint` counts per drive."""
-        if self._transport is None:
-            return None
-        missed = {drive.name: drive.missed for drive in self._drives}
-        return {**self._transport.statistics(), "missed_replies": sum(missed.values()), "missed_by_joint": missed}
+        return self._count(self._drives)
 
     # --- parts ------------------------------------------------------------------------------------------------------
-
-    @property
-    def _open(self) -> bool:
-        return self._channel is not None
-
-    def _require_open(self) -> Transport:
-        if self._channel is None or self._transport is None:
-            raise HardwareError("the arm is not connected", "call connect() first")
-        return self._transport
 
     def _expect(self, joint: str, drive: DriveProfile) -> Expected:
         model = self._robot.description.limits[joint]

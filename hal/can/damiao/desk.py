@@ -34,7 +34,7 @@ from robotctl.hal.can.service import Difference, Motor, Parameters
 from robotctl.hal.can.transport import Transport
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError, DriveError
-from robotctl.hal.profile import Drive
+from robotctl.hal.profile import DamiaoDrive
 from robotctl.hal.robot import Robot
 
 _STORE_TIMEOUT_S = 0.2
@@ -144,7 +144,7 @@ class DamiaoMotor(Motor):
                 different.append(Difference(info.name, theirs, ours))
         return different
 
-    def departures(self, robot: Robot, drive: Drive, mode: int, found: Mapping[str, float]) -> list[Difference]:
+    def departures(self, robot: Robot, drive: DamiaoDrive, mode: int, found: Mapping[str, float]) -> list[Difference]:
         assert robot.profile.can is not None
         counts = round(robot.profile.safety.drive_timeout_s / TIMEOUT_UNIT_S)
         pmax, vmax, tmax = MOTORS[drive.motor]

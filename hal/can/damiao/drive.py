@@ -4,7 +4,6 @@ Positions, velocities and efforts are those of the joint; the map to the motor's
 `motor angle = scale * (joint angle - zero - fold)`, with velocity likewise, and motor torque = joint torque / scale.
 """
 
-from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from robotctl.hal.can.damiao.codec import (
@@ -23,7 +22,7 @@ from robotctl.hal.can.damiao.motors import Ranges
 from robotctl.hal.can.damiao.registers import TIMEOUT_UNIT_S, Register, decode_value, encode_value
 from robotctl.hal.can.transport import Transport, route_key
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import DriveError, HardwareError
+from robotctl.hal.errors import DriveError
 
 TRIES = 5
 """Requests before a drive counts as silent; single replies are often lost in a burst at bring-up (axol uses 5)."""
@@ -57,22 +56,6 @@ class Identity(NamedTuple):
     timeout_s: float
     """The drive's own watchdog; 0 is off."""
     ranges: Ranges
-
-
-class DrivesError(HardwareError):
-    """Everything that is wrong with the drives of an arm, in `problems`."""
-
-    def __init__(self, problems: Iterable[DriveError]) -> None:
-        self.problems = tuple(problems)
-        super().__init__("\n".join([f"{len(self.problems)} problems with the drives", *map(str, self.problems)]))
-
-
-def raise_problems(problems: Sequence[DriveError]) -> None:
-    """Raise the one problem there is, or all of them as one; return if there is none."""
-    if len(problems) == 1:
-        raise problems[0]
-    if problems:
-        raise DrivesError(problems)
 
 
 class Drive:

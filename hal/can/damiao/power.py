@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 from robotctl.hal.can.damiao.codec import Special, Status
-from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, Drive, raise_problems
+from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, Drive
 from robotctl.hal.can.damiao.faults import fault_of, is_fault
 from robotctl.hal.can.damiao.verification import Expected, plausible_turns
+from robotctl.hal.can.problems import raise_problems
 from robotctl.hal.can.transport import Transport
 from robotctl.hal.errors import DriveError
 

@@ -40,7 +40,7 @@ class ReplayedDrives:
     def __init__(self, description: Mapping[str, Any]) -> None:
         """Build them from what `describe` returned."""
         clock = VirtualClock()
-        self._transport = Transport(Channel(_NoBus(), fd=True, simulated=True), clock)
+        self._transport = Transport(Channel(NoBus(), fd=True, simulated=True), clock)
         self._drives = []
         for each in description["drives"]:
             ranges = Ranges(*each["ranges"])
@@ -68,7 +68,9 @@ class ReplayedDrives:
         )
 
 
-class _NoBus(can.BusABC):  # type: ignore[misc]
+class NoBus(can.BusABC):  # type: ignore[misc]
+    """A bus without anybody."""
+
     def __init__(self) -> None:
         super().__init__("none")
         self._is_shutdown = True

@@ -286,7 +286,7 @@ def test_register_presets_that_make_no_sense(desk: Desk, order: str) -> None:
 
 def test_misreport_shifts_the_angle_and_nothing_else(desk: Desk) -> None:
     before = decode_feedback(desk.ask()[0].data, desk.drive.ranges)
-    desk.bench.trouble.add(Misreport(motor_id=MOTOR, offset=0.5, ranges=desk.drive.ranges))
+    desk.bench.trouble.add(Misreport(motor_id=MOTOR, offset=0.5, tell=desk.drive.shifted))
     after = decode_feedback(desk.ask()[0].data, desk.drive.ranges)
     assert after.position == pytest.approx(before.position + 0.5, abs=1e-3)
     assert after._replace(position=before.position) == before

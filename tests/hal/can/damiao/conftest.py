@@ -152,7 +152,7 @@ class Bench:
         self.gripper.registers[Register.CTRL_MODE] = 4
         self.bus = ScriptedBus([*self.motors, self.gripper])
         self.channel = Channel(self.bus, fd=True, simulated=True)
-        monkeypatch.setattr("robotctl.hal.can.damiao.arm.open_channel", lambda name, robot, clock: self.channel)
+        monkeypatch.setattr("robotctl.hal.can.arm.open_channel", lambda name, robot, clock: self.channel)
         self.arm = DamiaoArm(self.robot, self.clock, "scripted")
 
     def ready(self) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from robotctl.hal.can.channel import Channel
 from robotctl.hal.can.damiao.codec import BROADCAST_ID, MitCommand, Special, encode_mit, is_feedback
-from robotctl.hal.can.damiao.drive import DrivesError
+from robotctl.hal.can.problems import DrivesError
 from robotctl.hal.errors import BusError, ConfigError, DriveError, HardwareError
 from robotctl.hal.types import Command, CommandMode
 
@@ -400,7 +400,7 @@ def test_all_problems_are_one_error(bench):
 
 def test_lockstep_is_refused_where_the_drives_live_in_real_time(bench, monkeypatch):
     channel = Channel(bench.bus, fd=True, simulated=False)
-    monkeypatch.setattr("robotctl.hal.can.damiao.arm.open_channel", lambda name, robot, clock: channel)
+    monkeypatch.setattr("robotctl.hal.can.arm.open_channel", lambda name, robot, clock: channel)
     with pytest.raises(ConfigError, match="would move too fast") as caught:
         bench.arm.connect()
     assert "--fast" in str(caught.value)

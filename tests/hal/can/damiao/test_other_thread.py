@@ -30,7 +30,7 @@ def served(bench, monkeypatch):
     def open_virtual(name, robot, clock):
         return Channel(can.Bus(interface="virtual", channel="drives"), fd=True)
 
-    monkeypatch.setattr("robotctl.hal.can.damiao.arm.open_channel", open_virtual)
+    monkeypatch.setattr("robotctl.hal.can.arm.open_channel", open_virtual)
     thread = threading.Thread(target=serve)
     thread.start()
     yield bench

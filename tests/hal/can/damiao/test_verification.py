@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from robotctl.hal.can.damiao.drive import DrivesError
 from robotctl.hal.can.damiao.registers import Register
 from robotctl.hal.can.damiao.verification import plausible_turns
+from robotctl.hal.can.problems import DrivesError
 from robotctl.hal.errors import DriveError
 
 
