@@ -130,12 +130,15 @@ def _stop(bench: Bench, fault: Fault, expected: Expected, trial: Trial) -> None:
     trial.require(planted.showed(), "the fault did not show: it was not there")
     judge_stop(bench.robot, bench.since(onset), onset, expected, trial)
     if not trial.problems:
-        go_on(bench, planted, Clears.POWER if _takes_power(bench) else expected.clears, trial)
+        go_on(bench, planted, _clearing(bench, expected), trial)
 
 
-def _takes_power(bench: Bench) -> bool:
-    """Return whether a drive is to blame, or has a fault by now, whatever stopped the arm first."""
-    return bench.trips[0]["protection"] == Protection.DRIVE.label or faulty(bench)
+def _clearing(bench: Bench, expected: Expected) -> Clears:
+    """Return what clears a stop: a power cycle as well where a drive has come to a fault in the course of it."""
+    if expected.protection is Protection.DRIVE:
+        return expected.clears
+    failed = bench.trips[0]["protection"] == Protection.DRIVE.label or faulty(bench)
+    return Clears.POWER if failed else expected.clears
 
 
 def judge_trip(trips: Sequence[dict[str, Any]], expected: Expected, trial: Trial) -> None:

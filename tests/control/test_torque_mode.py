@@ -13,7 +13,7 @@ from robotctl.hal.types import Vector
 from robotctl.safety.machine import State
 from robotctl.safety.target import FreeDrive, JointTorque
 
-TICKS_PER_TARGET = 25
+POLICY_S = 0.05
 ACCELERATION_TOLERANCE = 1.0
 """Share of its cap by which a true joint acceleration, over a servo period, may exceed it ..."""
 WITH_WRONG_PAYLOAD = 2.0
@@ -72,9 +72,9 @@ class Judged:
 
     def run(self, policy: Policy | None, seconds: float) -> None:
         """Give the arm to a torque policy; without one, let it be led by hand."""
-        cap = self.robot.limits.torque
+        cap, ticks_per_target = self.robot.limits.torque, round(POLICY_S * self.robot.profile.servo_hz)
         for tick in range(round(seconds * self.robot.profile.servo_hz)):
-            if tick % TICKS_PER_TARGET == 0:
+            if tick % ticks_per_target == 0:
                 record = self.session.latest()
                 self.seq += 1
                 head = int(record["epoch"]), self.seq, self.session.clock.now_ns() + 10**8
