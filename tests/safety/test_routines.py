@@ -108,6 +108,8 @@ def test_goto_slows_down_where_the_tool_gets_faster_than_it_was_to(panda: Robot)
     for _ in range(100):
         wanted = routine.velocity(sample(start), start)
     assert wanted == pytest.approx(full)
+    fast_already = Goto(panda, home, "home", kinematics).velocity(sample(start, 0.91 * turning), start)
+    assert fast_already == pytest.approx(0.8 * full)
 
 
 @pytest.mark.parametrize(("distance", "done"), [(1.9e-3, True), (2.1e-3, False)])
