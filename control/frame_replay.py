@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotctl.control.frame_ring import FRAME_DTYPE, Flag
-from robotctl.control.recording import FRAMES_TOPIC, read_recording
+from robotctl.control.recorded import read_recording
+from robotctl.control.recording import FRAMES_TOPIC
 from robotctl.hal.can.cia402.replay import Replayed402
 from robotctl.hal.can.damiao.replay import ReplayedDrives
 from robotctl.hal.errors import ConfigError

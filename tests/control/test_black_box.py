@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robotctl.control.black_box import BlackBox, snapshot
-from robotctl.control.recording import read_recording
+from robotctl.control.recorded import read_recording
 from robotctl.control.shared import Link
 from robotctl.hal.robot import load_robot
 

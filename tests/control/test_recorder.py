@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robotctl.control.recorded import read_recording
 from robotctl.control.recorder import RecorderConfig, RecorderProcess
-from robotctl.control.recording import read_recording
 from robotctl.control.shared import Board, EventRing, Link
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import load_robot

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import robotctl
-from robotctl.control.recording import Recording, read_recording, wall_offset_ns
+from robotctl.control.recorded import read_recording
+from robotctl.control.recording import Recording, wall_offset_ns
 from robotctl.control.shared import tick_dtype
 from robotctl.hal.clock import VirtualClock
 from robotctl.hal.robot import load_robot

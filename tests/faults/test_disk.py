@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from robotctl.control.recording import read_recording
+from robotctl.control.recorded import read_recording
 
 pytestmark = pytest.mark.realtime
 

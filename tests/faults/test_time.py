@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from robotctl.control.recording import read_recording
+from robotctl.control.recorded import read_recording
 
 from .conftest import Emulator
 

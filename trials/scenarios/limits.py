@@ -7,8 +7,6 @@ from robotctl.trials.policies import Act, against_limit, bang_bang, before_limit
 from robotctl.trials.scenario import Scenario
 from robotctl.trials.shaping import clipped, shaped_scenario, too_fast
 
-_COASTING = frozenset({"position"})
-"""While a tick is late, the drives go on as they were told: more than the margins of a loop in time are made for."""
 _OFTEN_LATE = 0.15
 _LATEST = 2.0
 """Servo periods, as long as that is ..."""
@@ -51,6 +49,5 @@ def scenarios(_robot: Robot, _backend: str) -> list[Scenario]:
             _steps,
             too_fast,
             pace=jitter,
-            excused=_COASTING,
         ),
     ]
