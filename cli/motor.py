@@ -134,9 +134,8 @@ def restore(
     json: _Json = None,
 ) -> None:
     """Write what a file says back to drives, where it differs. Ids and bit rate stay as they are."""
-    kept = read_dump(file)
     with _bench(channel, robot) as bench:
-        done = []
+        kept, done = read_dump(file), []
         for drive in bench.motors(motors or []):
             wanted = kept.motor(drive.id)
             different = [d for d in drive.differences(wanted.parameters, drive.read()) if d.name in drive.restorable]
@@ -160,8 +159,8 @@ def diff(
     json: _Json = None,
 ) -> None:
     """Compare drives with the profile, or with a dump. Exit status 4 if they differ."""
-    kept = read_dump(file) if file is not None else None
     with _bench(channel, robot) as bench:
+        kept = read_dump(file) if file is not None else None
         report: list[dict[str, Any]] = []
         for drive in bench.motors(motors or []):
             who = f"{bench.name(drive.id)} (0x{drive.id:02X})"

@@ -47,16 +47,8 @@ class Emulator:
         self._ids = {joint.drive.id for joint in robot.profile.joints if joint.drive}
         self._told = folder / "emulate.log"
         self._frames = folder / "bus.log"
-        command = [
-            sys.executable,
-            "-m",
-            "robotctl.cli.main",
-            "emulate",
-            "--robot",
-            str(robot.source),
-            "--log",
-            str(self._frames),
-        ]
+        command = [sys.executable, "-m", "robotctl.cli.main", "emulate"]
+        command += ["--robot", str(robot.source), "--log", str(self._frames)]
         if self._canopen:
             command += ["--register", f"all:0x1016.1={HOST_ID << 16 | round(1e3 * watchdog_s)}"]
         else:

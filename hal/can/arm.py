@@ -4,14 +4,17 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
+import numpy as np
+
 from robotctl.hal.arm import Arm, Inspector
 from robotctl.hal.can.channel import Channel, is_shared, open_channel, reopen_channel
+from robotctl.hal.can.problems import DrivesError
 from robotctl.hal.can.tap import Tap
 from robotctl.hal.can.transport import Transport
 from robotctl.hal.clock import Clock, VirtualClock
-from robotctl.hal.errors import ConfigError, HardwareError
+from robotctl.hal.errors import ConfigError, DriveError, HardwareError
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Command, Fault, Truth
+from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Truth, Vector, frozen
 
 _BUS_FAULTS = {
     "bus-off": Fault(
@@ -24,20 +27,37 @@ _BUS_FAULTS = {
 """What the states of a controller in trouble mean to a person."""
 
 
-class Counted(Protocol):
-    """A drive, as far as statistics go."""
+class MeasuringDrive(Protocol):
+    """A drive of a joint, as far as every protocol's is alike."""
 
     name: str
     missed: int
+    position: float
+    """rad, as velocity and effort are the joint's, too."""
+    velocity: float
+    effort: float
+    stamp_ns: int
 
 
-def bus_faults(transport: Transport) -> tuple[Fault, ...]:
+class DrivenGripper(Protocol):
+    """A gripper whose drive goes off with those of the arm."""
+
+    def release(self) -> None:
+        """Forget what it was told: its drive is off, or will be."""
+        ...
+
+
+def _bus_faults(transport: Transport) -> tuple[Fault, ...]:
     """Return what the controller suffers from."""
     return (_BUS_FAULTS[transport.state],) if transport.state in _BUS_FAULTS else ()
 
 
 class CanArm(Arm):
     """Opens its channel in `connect` and not before. `warnings` holds what bring-up put right."""
+
+    gripper: DrivenGripper | None
+    _joints: Sequence[MeasuringDrive]
+    """The drives of the joints; none before `_attach`."""
 
     def __init__(self, robot: Robot, clock: Clock, channel: str) -> None:
         """Prepare. Opens and sends nothing.
@@ -60,6 +80,12 @@ class CanArm(Arm):
         self._transport: Transport | None = None
         self._verified = False
         self._enabled = False
+        self._zeros = frozen([0.0] * robot.dof)
+        self._still = [0.0] * robot.dof
+        self._feed_forward: Vector = self._zeros
+        """Effort of the latest command: what a hold goes on with (n,), Nm."""
+        self._polled_ns = 0
+        """When drives that are off were last asked how they are."""
 
     @property
     def channel(self) -> Channel | None:
@@ -93,7 +119,37 @@ class CanArm(Arm):
         self._verified = self._enabled = True
         self._take_over(command)
 
+    def hold(self) -> Sent:
+        """Ask the drives to hold the measured pose, with the effort of the latest command as feed-forward.
+
+        Raises:
+            BusError: if the bus is gone.
+        """
+        position = np.array([drive.position for drive in self._joints])
+        return self.write(Command(CommandMode.TRACK, position, self._zeros, self._feed_forward))
+
+    def disable(self) -> None:
+        """Take the torque away from every drive, the gripper's too. Resent up to ten times until confirmed.
+
+        Raises:
+            DriveError: if one drive never confirms; DrivesError if several do not.
+            BusError: if the bus is gone.
+        """
+        self._enabled = False
+        self._feed_forward = self._zeros
+        if self.gripper:
+            self.gripper.release()
+        if not self._open:
+            return
+        try:
+            self._switch_off()
+        except (DriveError, DrivesError):
+            self._verified = False
+            raise
+
     def close(self) -> None:
+        if self.gripper:
+            self.gripper.release()
         self._verified = self._enabled = False
         if self._transport is not None:
             self._transport.close()
@@ -110,6 +166,10 @@ class CanArm(Arm):
         """Build the drives on a transport that was just opened. Send nothing."""
 
     @abstractmethod
+    def _switch_off(self) -> None:
+        """Take the torque away from every drive, confirmed."""
+
+    @abstractmethod
     def _take_over(self, command: Command) -> None:
         """Send `command` to drives that are on, and learn where they are."""
 
@@ -122,7 +182,22 @@ class CanArm(Arm):
             raise HardwareError("the arm is not connected", "call connect() first")
         return self._transport
 
-    def _count(self, drives: Sequence[Counted]) -> dict[str, object] | None:
+    def _sample(self, now_ns: int, faults: tuple[Fault, ...], temperature: Vector | None, *, enabled: bool) -> Sample:
+        """Return what the joints' drives told last, and what the bus suffers from."""
+        joints, transport = self._joints, self._require_open()
+        return Sample(
+            now_ns,
+            np.array([drive.position for drive in joints]),
+            np.array([drive.velocity for drive in joints]),
+            np.array([drive.effort for drive in joints]),
+            np.array([drive.stamp_ns for drive in joints], dtype=np.int64),
+            faults + _bus_faults(transport),
+            enabled,
+            temperature,
+            transport.rejected,
+        )
+
+    def _count(self, drives: Sequence[MeasuringDrive]) -> dict[str, object] | None:
         """Return the counters since `connect`; they outlive `close`. `missed_by_joint` counts per drive."""
         if self._transport is None:
             return None

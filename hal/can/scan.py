@@ -12,7 +12,7 @@ from robotctl.hal.can.transport import Transport
 from robotctl.hal.can.verdict import Attempt, bus_findings
 from robotctl.hal.can.ways import Way, blind_spots, open_way, other_ways, own_way
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import BusError, ConfigError
+from robotctl.hal.errors import BusError
 from robotctl.hal.host import Finding
 from robotctl.hal.robot import Robot
 
@@ -72,10 +72,9 @@ def sweep(
         ConfigError: if the channel's name has no known form, or the robot has no CAN drives.
         BusError: if the channel cannot be opened, or is lost.
     """
-    wiring = robot.profile.can
     channel = open_channel(name, robot, clock)
-    if wiring is None:
-        raise ConfigError(f"robot {robot.profile.name!r} has no CAN drives")
+    wiring = robot.profile.can
+    assert wiring is not None  # or there is no channel
     with _open(channel):
         attempts = [scan(channel, clock, last_id, own_way(name, wiring))]
         silent = bool(attempts[0].failure)

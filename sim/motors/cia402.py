@@ -29,6 +29,7 @@ from robotctl.hal.can.cia402.faults import HOST_LOST, fault_of
 from robotctl.hal.can.cia402.machine import State
 from robotctl.hal.can.cia402.objects import Entry
 from robotctl.hal.profile import Cia402Drive as Wiring
+from robotctl.sim.motors.commissioned import BEAT_NS, DISABLE_VOLTAGE, FAULT_SIGNAL, QUICK_STOP, commissioned
 from robotctl.sim.motors.cyclic import Loops
 from robotctl.sim.motors.dictionary import OUT_OF_RANGE, Abort, Dictionary, serve
 from robotctl.sim.motors.drive import FOREVER, Defer, Handler, Reply
@@ -40,13 +41,10 @@ QUICK_STOP_DECELERATION = 30.0
 """Of a joint, rad/s^2."""
 FOLLOWING_WINDOW = 0.5
 """Of a joint, rad (object 0x6065 of a drive that has it)."""
-BEAT_NS = 100_000_000
-"""Its own heartbeat."""
 
 _OVER_CURRENT, _UNDER_VOLTAGE, _TOO_HOT, _FOLLOWING = 0x2310, 0x3220, 0x4310, 0x8611
 _LEAST_VOLTAGE = 18.0
 _COMMUNICATION_ERROR, _GENERIC_ERROR = 0x10, 0x01
-_SUPPORTED = 1 << (Mode.POSITION - 1) | 1 << (Mode.VELOCITY - 1) | 1 << (Mode.TORQUE - 1)
 _BITS = {
     State.NOT_READY: 0x0200,
     State.OFF: 0x0250,
@@ -60,18 +58,8 @@ _BITS = {
 _FOLLOWS = 0x1000
 """Bit 12 of the statusword in the cyclic modes."""
 _TORQUE = (State.ENABLED, State.QUICK_STOP, State.FAULT_REACTION)
-_FAULT_SIGNAL, _DISABLE_VOLTAGE, _QUICK_STOP = 1, 2, 3
-"""Options of 0x6007; 0 is to do nothing."""
 _STAY = 5
 """Least quick stop option (0x605A) with which a drive stays in QUICK STOP ACTIVE."""
-
-_MAKERS_PDOS: tuple[tuple[Service, Entry | None], ...] = (
-    (Service.RPDO1, od.CONTROLWORD),
-    (Service.RPDO2, None),
-    (Service.TPDO1, od.STATUSWORD),
-    (Service.TPDO2, None),
-)
-"""What is mapped when it leaves the factory; event-driven."""
 
 Say = Callable[[int, bytes], None]
 """Takes id and data of a frame that goes out now."""
@@ -143,7 +131,8 @@ class Cia402Drive:
         self._listens = False
         """Whether a heartbeat of the host has come, so that the next one is waited for."""
         self._host_lost = False
-        self.dictionary = self._commissioned(watchdog_s, peak)
+        self.dictionary = commissioned(wiring, watchdog_s, peak)
+        self._bind(self.dictionary)
         self._pdos = [Pdo(self.dictionary, *record) for record in RECORDS]
         self._waiting: dict[int, bytes] = {}
         """Frames of synchronous RPDOs until SYNC, by index of the PDO."""
@@ -420,12 +409,12 @@ class Cia402Drive:
         option = self.dictionary[od.ABORT_OPTION]
         if self.state is not State.ENABLED:
             return
-        if option == _FAULT_SIGNAL:
+        if option == FAULT_SIGNAL:
             self.error = HOST_LOST
             self._quick_stop(State.FAULT_REACTION)
-        elif option == _DISABLE_VOLTAGE:
+        elif option == DISABLE_VOLTAGE:
             self._go(State.OFF)
-        elif option == _QUICK_STOP:
+        elif option == QUICK_STOP:
             self._quick_stop(State.QUICK_STOP)
 
     # --- inside -----------------------------------------------------------------------------------------------------
@@ -493,39 +482,9 @@ class Cia402Drive:
     def _statusword(self) -> int:
         return _BITS[self.state] | (_FOLLOWS if self.enabled and self._mode is not Mode.NONE else 0)
 
-    def _commissioned(self, watchdog_s: float, peak: float) -> Dictionary:
-        """Return its dictionary as an integrator leaves it, with a maker's idea of PDOs."""
-        made = Dictionary(RECORDS)
-        wiring = self._wiring
-        values = {
-            od.DEVICE_TYPE: 2 << 16 | od.DEVICE_PROFILE,
-            od.HEARTBEAT_CONSUMER: HOST_ID << 16 | round(watchdog_s * 1e3),
-            od.HEARTBEAT_PRODUCER: BEAT_NS // 1_000_000,
-            od.VENDOR: wiring.vendor or 0x5A5A,
-            od.PRODUCT: wiring.product or 0x402,
-            od.REVISION: 0x0001_0000,
-            od.SERIAL: 0x2600_0000 + wiring.id,
-            od.ABORT_OPTION: _QUICK_STOP,
-            od.QUICK_STOP_OPTION: 2,
-            od.MAX_TORQUE: min(round(peak * self._permille * 1.05), 0xFFFF),
-            od.RATED_TORQUE: round(wiring.rated_torque * 1e3),
-            od.MAX_MOTOR_SPEED: 6000,
-            od.INCREMENTS: wiring.resolution,
-            od.REVOLUTIONS: 1,
-            od.VELOCITY_UNIT: od.INCREMENTS_PER_SECOND,
-            od.CYCLE: 10,
-            od.CYCLE_EXPONENT: -3,
-            od.SUPPORTED_MODES: _SUPPORTED,
-        }
-        for entry, value in values.items():
-            made.preset((entry.index, entry.sub), value)
-        for (communication, mapping), (service, first) in zip(RECORDS, _MAKERS_PDOS, strict=True):
-            made.preset((communication, 1), service + self.id | (0 if first else od.INVALID))
-            made.preset((communication, 2), 255)
-            if first is not None:
-                made.preset((mapping, 1), od.mapped(first))
-                made.preset((mapping, 0), 1)
-        made.live = {
+    def _bind(self, dictionary: Dictionary) -> None:
+        """Have the dictionary show what is measured, and ask before and tell after a write."""
+        dictionary.live = {
             (0x603F, 0): lambda: self.error,
             (0x1001, 0): lambda: _GENERIC_ERROR if self.error else 0,
             (0x6041, 0): self._statusword,
@@ -534,5 +493,4 @@ class Cia402Drive:
             (0x606C, 0): self._speed,
             (0x6077, 0): self._torque,
         }
-        made.before_write, made.after_write = self._check, self._written
-        return made
+        dictionary.before_write, dictionary.after_write = self._check, self._written

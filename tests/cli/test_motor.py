@@ -86,3 +86,9 @@ def test_another_motor_than_in_the_file_is_told(tmp_path):
     file.write_text(text)
     output = invoke("diff", "5", "6", "--file", str(file), status=4)
     assert output.count("swapped?") == 2
+
+
+@pytest.mark.parametrize("words", [("restore",), ("diff", "--file")])
+def test_a_dump_that_is_not_there_is_named(words, tmp_path):
+    missing = tmp_path / "missing.yaml"
+    assert f"{missing}: No such file" in invoke(*words, str(missing), status=2)

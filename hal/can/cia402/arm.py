@@ -13,9 +13,7 @@ stands still; only in torque mode, which leaves no other choice, a torque goes o
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
-from robotctl.hal.can.arm import CanArm, bus_faults
+from robotctl.hal.can.arm import CanArm
 from robotctl.hal.can.cia402.codec import SYNC_ID, Mode, Nmt
 from robotctl.hal.can.cia402.drive import Drive
 from robotctl.hal.can.cia402.machine import Goal, State, controlword
@@ -23,14 +21,15 @@ from robotctl.hal.can.cia402.network import HostNetwork
 from robotctl.hal.can.cia402.power import CYCLE_S, clear_faults, not_ready, switch_off, switch_on
 from robotctl.hal.can.cia402.replay import describe
 from robotctl.hal.can.cia402.verification import Expected, Identity, verify_drive
+from robotctl.hal.can.damiao.gripper import DamiaoGripper
 from robotctl.hal.can.damiao.passenger import Passenger
-from robotctl.hal.can.problems import DrivesError, raise_problems
+from robotctl.hal.can.problems import raise_problems
 from robotctl.hal.can.transport import Transport
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError, DriveError, HardwareError
 from robotctl.hal.profile import Cia402Drive, DamiaoDrive
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Vector, frozen
+from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent
 
 FRAME_BITS = (125, 115, 135, 105)
 """Of RPDO1, RPDO2, TPDO1 and TPDO2 (7, 6, 8 and 5 bytes) at the worst of bit stuffing."""
@@ -70,19 +69,16 @@ class Cia402Arm(CanArm):
             if gripper and isinstance(gripper.drive, DamiaoDrive)
             else None
         )
-        self.gripper = self._passenger.gripper if self._passenger else None
+        self.gripper: DamiaoGripper | None = self._passenger.gripper if self._passenger else None
         self._drives: list[Drive] = []
+        self._joints: list[Drive] = self._drives
         self._network: HostNetwork | None = None
-        self._zeros = frozen([0.0] * robot.dof)
-        self._still = [0.0] * robot.dof
-        self._feed_forward: Vector = self._zeros
-        self._polled_ns = 0
 
     # --- life -------------------------------------------------------------------------------------------------------
 
     def _attach(self, transport: Transport) -> None:
         self._network = HostNetwork(transport, self._clock)
-        self._drives = [Drive(name, wiring, self._network) for name, wiring in self._specs]
+        self._drives = self._joints = [Drive(name, wiring, self._network) for name, wiring in self._specs]
         if self._passenger:
             self._passenger.attach(transport)
 
@@ -188,18 +184,7 @@ class Cia402Arm(CanArm):
                 faults += (fault,)
         if self._passenger:
             faults += self._passenger.faults()
-        faults += bus_faults(transport)
-        return Sample(
-            now,
-            np.array([drive.position for drive in drives]),
-            np.array([drive.velocity for drive in drives]),
-            np.array([drive.effort for drive in drives]),
-            np.array([drive.stamp_ns for drive in drives], dtype=np.int64),
-            faults,
-            all(drive.state is State.ENABLED for drive in drives),
-            None,
-            transport.rejected,
-        )
+        return self._sample(now, faults, None, enabled=all(drive.state is State.ENABLED for drive in drives))
 
     def write(self, command: Command) -> Sent:
         """Send one cycle. Says in the result what was clipped by the wire's range or kept back.
@@ -242,38 +227,6 @@ class Cia402Arm(CanArm):
                 return self._altered(command)
         return Sent(command)
 
-    def hold(self) -> Sent:
-        """Ask the drives to hold the measured pose, with the effort of the latest command as feed-forward.
-
-        Raises:
-            BusError: if the bus is gone.
-        """
-        position = np.array([drive.position for drive in self._drives])
-        return self.write(Command(CommandMode.TRACK, position, self._zeros, self._feed_forward))
-
-    def disable(self) -> None:
-        """Take the torque away from every drive, the gripper's too. Resent up to ten times until confirmed.
-
-        Raises:
-            DriveError: if one drive never confirms; DrivesError if several do not.
-            BusError: if the bus is gone.
-        """
-        self._enabled = False
-        self._feed_forward = self._zeros
-        if self._passenger:
-            self._passenger.gripper.release()
-        if not self._open:
-            return
-        try:
-            try:
-                switch_off(self._drives, self._require_network())
-            finally:
-                if self._passenger:
-                    self._passenger.disable()
-        except (DriveError, DrivesError):
-            self._verified = False
-            raise
-
     def clear_faults(self) -> None:
         """Clear the fault of every drive that reports one. Enables nothing.
 
@@ -286,11 +239,6 @@ class Cia402Arm(CanArm):
         if self._passenger:
             self._passenger.clear()
 
-    def close(self) -> None:
-        if self._passenger:
-            self._passenger.gripper.release()
-        super().close()
-
     # --- about ------------------------------------------------------------------------------------------------------
 
     def bus_statistics(self) -> dict[str, object] | None:
@@ -298,6 +246,13 @@ class Cia402Arm(CanArm):
         return self._count([*self._drives, *passengers])
 
     # --- parts ------------------------------------------------------------------------------------------------------
+
+    def _switch_off(self) -> None:
+        try:
+            switch_off(self._drives, self._require_network())
+        finally:
+            if self._passenger:
+                self._passenger.disable()
 
     def _require_network(self) -> HostNetwork:
         self._require_open()

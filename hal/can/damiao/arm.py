@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from robotctl.hal.can.arm import CanArm, bus_faults
+from robotctl.hal.can.arm import CanArm
 from robotctl.hal.can.damiao.codec import KD_MAX, KP_MAX, Special, Status
 from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, Identity
 from robotctl.hal.can.damiao.faults import fault_of, status_name
@@ -19,13 +19,13 @@ from robotctl.hal.can.damiao.power import clear_faults, not_ready, switch_off
 from robotctl.hal.can.damiao.registers import ControlMode
 from robotctl.hal.can.damiao.replay import describe
 from robotctl.hal.can.damiao.verification import Eavesdropper, Expected, verify_drive
-from robotctl.hal.can.problems import DrivesError, raise_problems
+from robotctl.hal.can.problems import raise_problems
 from robotctl.hal.can.transport import Transport, route_key
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import ConfigError, DriveError, HardwareError
 from robotctl.hal.profile import DamiaoDrive as DriveProfile
 from robotctl.hal.robot import Robot
-from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Vector, frozen
+from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent, Vector
 
 _POLL_PERIOD_NS = 3_500_000
 """Between two requests for feedback while the drives are off; every second tick at 500 Hz, 40 % load on FD."""
@@ -62,11 +62,7 @@ class DamiaoArm(CanArm):
         _check(robot, self._specs)
         self._drives: list[Drive] = []
         self._joints: list[Drive] = []
-        self._zeros = frozen([0.0] * robot.dof)
-        self._still = [0.0] * robot.dof
-        self._feed_forward = self._zeros
         self._gains: dict[CommandMode, list[int]] = {}
-        self._polled_ns = 0
 
     # --- life -------------------------------------------------------------------------------------------------------
 
@@ -184,18 +180,8 @@ class DamiaoArm(CanArm):
         for drive in self._drives:
             if drive.status > 1:
                 faults += (fault_of(drive.name, drive.status),)
-        faults += bus_faults(transport)
-        return Sample(
-            now,
-            np.array([drive.position for drive in joints]),
-            np.array([drive.velocity for drive in joints]),
-            np.array([drive.effort for drive in joints]),
-            np.array([drive.stamp_ns for drive in joints], dtype=np.int64),
-            faults,
-            enabled,
-            np.array([max(drive.mosfet_temperature, drive.rotor_temperature) for drive in joints], dtype=np.float64),
-            transport.rejected,
-        )
+        hottest = [float(max(drive.mosfet_temperature, drive.rotor_temperature)) for drive in joints]
+        return self._sample(now, faults, np.array(hottest), enabled=enabled)
 
     def write(self, command: Command) -> Sent:
         """Send one MIT frame per joint. Says in the result what was clipped by the wire's range or kept back.
@@ -243,34 +229,6 @@ class DamiaoArm(CanArm):
                 return self._altered(command, frames)
         return Sent(command)
 
-    def hold(self) -> Sent:
-        """Ask the drives to hold the measured pose, with the effort of the latest command as feed-forward.
-
-        Raises:
-            BusError: if the bus is gone.
-        """
-        position = np.array([drive.position for drive in self._joints])
-        return self.write(Command(CommandMode.TRACK, position, self._zeros, self._feed_forward))
-
-    def disable(self) -> None:
-        """Take the torque away from every drive, the gripper's too. Resent up to ten times until confirmed.
-
-        Raises:
-            DriveError: if one drive never confirms; DrivesError if several do not.
-            BusError: if the bus is gone.
-        """
-        self._enabled = False
-        self._feed_forward = self._zeros
-        if self.gripper:
-            self.gripper.release()
-        if not self._open:
-            return
-        try:
-            switch_off(self._drives, self._require_open())
-        except (DriveError, DrivesError):
-            self._verified = False
-            raise
-
     def clear_faults(self) -> None:
         """Clear the fault of every drive that reports one. Enables nothing.
 
@@ -281,11 +239,6 @@ class DamiaoArm(CanArm):
         self._require_open()
         clear_faults(self._drives)
 
-    def close(self) -> None:
-        if self.gripper:
-            self.gripper.release()
-        super().close()
-
     # --- about ------------------------------------------------------------------------------------------------------
 
     def bus_statistics(self) -> dict[str, object] | None:
@@ -293,6 +246,9 @@ class DamiaoArm(CanArm):
         return self._count(self._drives)
 
     # --- parts ------------------------------------------------------------------------------------------------------
+
+    def _switch_off(self) -> None:
+        switch_off(self._drives, self._require_open())
 
     def _expect(self, joint: str, drive: DriveProfile) -> Expected:
         model = self._robot.description.limits[joint]
