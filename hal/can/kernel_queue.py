@@ -30,7 +30,7 @@ class KernelQueue:
 
     def waiting(self) -> bool:
         memory = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
-        return struct.unpack_from("I", memory, 4 * _WRITE_ALLOC)[0] > 0
+        return int(_MEMINFO.unpack(memory)[_WRITE_ALLOC]) > 0
 
     def purge(self) -> None:
         for state in ("down", "up"):
@@ -40,15 +40,17 @@ class KernelQueue:
 
     def witness(self) -> Witness:
         try:
-            return can.Bus(interface="socketcan", channel=self._interface, fd=True, ignore_config=True)
+            witness: Witness = can.Bus(interface="socketcan", channel=self._interface, fd=True, ignore_config=True)
         except (can.CanError, OSError) as error:
             raise BusError(f"cannot listen on {self._interface}: {error}", "check that the interface is up") from error
+        return witness
 
     def _set(self, state: str) -> None:
         command = [shutil.which("ip", path="/sbin:/usr/sbin:/bin:/usr/bin") or "ip", "link", "set", self._interface]
         try:
             done = subprocess.run([*command, state], capture_output=True, timeout=_COMMAND_S, check=False)
-            problem = done.stderr.decode(errors="replace").strip() if done.returncode else ""
+            said = done.stderr.decode(errors="replace").strip()
+            problem = said or "it does not say why" if done.returncode else ""
         except (OSError, subprocess.SubprocessError) as error:
             problem = str(error)
         if problem:

@@ -98,7 +98,7 @@ def _frames_before(
     witness: Witness, probe: tuple[int, bytes], commands: Collection[int], clock: Clock
 ) -> list[int] | None:
     """Return the ids of the commands that left before the probe; None if the probe has not left in time."""
-    stale = []
+    stale: list[int] = []
     deadline = clock.now_ns() + round(PROOF_TIMEOUT_S * 1e9)
     while True:
         message = witness.recv(0.0)

@@ -149,6 +149,7 @@ def _stale(robot: Robot, backend: str, seed: int) -> Trial:
         bench.take_events()
         trips = [(trip["protection"], trip["stop_category"]) for trip in bench.trips]
         trial.require(trips == [("P14", Category.BRAKE_OFF), ("P14", Category.CUT)], f"tripped: {trips}")
+        trial.require("take the interface down and up" in bench.trips[-1]["text"], f"said: {bench.trips[-1]['text']}")
         trial.figures["reaction_s"] = (bench.trips[0]["stamp_ns"] - onset) * 1e-9
         trial.require(bus.waiting(), "no frame waited for the power")
         with suppress(HardwareError):  # no drive confirms that it is off
@@ -162,7 +163,7 @@ def _stale(robot: Robot, backend: str, seed: int) -> Trial:
             torque |= bool(motors.plant.truth().effort.any())
         trial.require(witness.recv(0.0) is None, "old frames were sent when the power came back")
         trial.require(not torque, "torque came back")
-    trial.seen = "P14; what waited was taken back"
+    trial.seen = "P14, then the bus was given up; nothing old left"
     return trial
 
 
@@ -224,19 +225,31 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         return []
     period = robot.period_ns * 1e-9
     safety = robot.profile.safety
-    told = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF)
+    told = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF, words="check cable, termination")
     # For as long as nothing leaves, the drives go on as they were told last.
     coasting = replace(told, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position", "velocity"}))
-    held_back = replace(coasting, within_s=_UNDELIVERED_TICKS * period)
+    held_back = replace(coasting, within_s=_UNDELIVERED_TICKS * period, words="check power and cable")
     senseless = Expected(
-        protection=Protection.RECEIVE, category=Category.BRAKE_OFF, within_s=safety.rejected_frames * period
+        protection=Protection.RECEIVE,
+        category=Category.BRAKE_OFF,
+        within_s=safety.rejected_frames * period,
+        words="look for another sender on the bus",
     )
-    silent = Expected(protection=Protection.FEEDBACK, category=Category.BRAKE_OFF, within_s=safety.feedback_fault_s)
+    silent = Expected(
+        protection=Protection.FEEDBACK,
+        category=Category.BRAKE_OFF,
+        within_s=safety.feedback_fault_s,
+        words="check its power, its connector and the bus",
+    )
     return [
         stop_scenario(12, "very late", "all answers come 80 ms late", _late, silent.losing_torque(robot)),
         stop_scenario(14, "error-passive", "the controller sees too many errors", _passive, told),
         stop_scenario(
-            14, "restart", "the controller leaves the bus, and is restarted after 40 ms", _restarting, coasting
+            14,
+            "restart",
+            "the controller leaves the bus, and is restarted after 40 ms",
+            _restarting,
+            replace(coasting, words="check cable and termination"),
         ),
         stop_scenario(
             14, "full, no errno", "the same full queue, as `select` tells it", _full_without_number, held_back
