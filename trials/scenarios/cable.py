@@ -227,7 +227,7 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     safety = robot.profile.safety
     told = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF, words="check cable, termination")
     # For as long as nothing leaves, the drives go on as they were told last.
-    coasting = replace(told, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position", "velocity"}))
+    coasting = replace(told, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position"}))
     held_back = replace(coasting, within_s=_UNDELIVERED_TICKS * period, words="check power and cable")
     senseless = Expected(
         protection=Protection.RECEIVE,

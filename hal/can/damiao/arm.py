@@ -237,7 +237,7 @@ class DamiaoArm(CanArm):
             # The replies are there already: stamp them now, not one tick later.
             transport.drain()
         if count < len(frames):
-            text = f"{len(frames) - count} frames were not sent: the transmit queue is full"
+            text = f"{len(frames) - count} frames were not sent: nothing leaves, or the transmit queue is full"
             return Sent(command, text, delivered=False)
         for drive in joints:
             if drive.saturated or drive.status != 1:
