@@ -13,7 +13,8 @@ from robotctl.hal.can.damiao.codec import (
 )
 from robotctl.hal.can.damiao.motors import Ranges
 from robotctl.hal.can.damiao.registers import Register
-from robotctl.sim.motors.trouble import Reply, Trouble
+from robotctl.sim.motors.drive import Reply
+from robotctl.sim.motors.trouble import Trouble
 
 
 @dataclass(frozen=True, kw_only=True)

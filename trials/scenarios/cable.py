@@ -17,9 +17,10 @@ from robotctl.safety.trip import Category, Protection
 from robotctl.sim.motors import strangers
 from robotctl.sim.motors import trouble as wire
 from robotctl.sim.motors.bus import EmulatedBus
+from robotctl.sim.motors.damiao import DamiaoDrive
 from robotctl.sim.trouble import Trouble
 from robotctl.trials.bench import Bench
-from robotctl.trials.faults import Planted, between, everywhere, on_wire
+from robotctl.trials.faults import Planted, between, everywhere, on_canopen, on_wire
 from robotctl.trials.orphans import orphan_scenario, without_bus
 from robotctl.trials.scenario import Scenario, Trial
 from robotctl.trials.shaping import tolerated_scenario
@@ -182,6 +183,7 @@ def _impostor(bench: Bench) -> Planted:
     joint = bench.robot.profile.joints[axis]
     assert joint.drive is not None
     drive = bench.motors.drive(joint.name)
+    assert isinstance(drive, DamiaoDrive)
     begun = bench.now_ns
     received = _count(bench, "received")
 
@@ -228,6 +230,8 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     told = Expected(protection=Protection.BUS, category=Category.BRAKE_OFF, words="check cable, termination")
     # For as long as nothing leaves, the drives go on as they were told last.
     coasting = replace(told, rest_s=_COASTING_REST_S, excused=frozenset({"sphere", "position"}))
+    if on_canopen(robot):  # in mode 8 a drive makes up for the way that it was not told of
+        coasting = replace(coasting, excused=coasting.excused | {"velocity"})
     held_back = replace(coasting, within_s=_UNDELIVERED_TICKS * period, words="check power and cable")
     senseless = Expected(
         protection=Protection.RECEIVE,
@@ -241,7 +245,7 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         within_s=safety.feedback_fault_s,
         words="check its power, its connector and the bus",
     )
-    return [
+    found = [
         stop_scenario(12, "very late", "all answers come 80 ms late", _late, silent.losing_torque(robot)),
         stop_scenario(14, "error-passive", "the controller sees too many errors", _passive, told),
         stop_scenario(
@@ -272,6 +276,11 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         orphan_scenario(14, "down and up", "the interface goes down, and up again", _down, _up_again),
         tolerated_scenario(14, "error frames", "1 % of all frames are broken on the wire", _noise),
         tolerated_scenario(15, "babbling", "a node sends three frames beside every answer", _babble),
+    ]
+    if on_canopen(robot):
+        return found
+    return [
+        *found,
         stop_scenario(
             15, "wrong node", "a second motor with the same ids answers, too", _impostor, senseless.losing_torque(robot)
         ),
