@@ -219,7 +219,10 @@ class ProcessSession(Session):
         if event["type"] == "bus":
             self._bus = event["statistics"]
         elif event["type"] == "error":
-            self._error = event
+            # A second one tells what the first has left behind.
+            self._error = (
+                event if self._error is None else self._error | {"text": f"{self._error['text']}\n{event['text']}"}
+            )
         elif (
             event["type"] == "trip" and event["protection"] == Protection.WATCHMAN.label and not event["stop_category"]
         ):

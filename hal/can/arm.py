@@ -95,9 +95,12 @@ class CanArm(Arm):
 
     def close(self) -> None:
         self._verified = self._enabled = False
-        if self._transport is not None:
-            self._transport.close()
         self._channel = None
+        if self._transport is not None:
+            try:
+                self._transport.purge()
+            finally:
+                self._transport.close()
 
     def truth(self) -> Truth | None:
         channel = self._channel

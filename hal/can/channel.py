@@ -16,6 +16,8 @@ from typing import Any
 
 import can
 
+from robotctl.hal.can.kernel_queue import KernelQueue
+from robotctl.hal.can.outbox import Outbox
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError, ConfigError
 from robotctl.hal.profile import CanBus
@@ -43,6 +45,8 @@ class Channel:
     """The true state of the plant behind it, where that is known."""
     simulated: bool = False
     """Whether its time is the clock's that it was opened with, and nothing arrives unless that clock moves."""
+    outbox: Outbox | None = None
+    """What is known of frames that have not left; None where nothing is."""
 
     def close(self) -> bool:
         """Shut the bus down, and return whether that went well; an interface that has vanished cannot be closed.
@@ -136,7 +140,8 @@ def open_wired(name: str, wiring: CanBus, options: Mapping[str, Any]) -> Channel
     """
     interface, _, where = name.partition(":")
     bus = open_bus(interface, where, options)
-    return Channel(bus, fd=wiring.fd and bus.protocol is not can.CanProtocol.CAN_20)
+    outbox = KernelQueue(where, bus) if interface == "socketcan" else None
+    return Channel(bus, fd=wiring.fd and bus.protocol is not can.CanProtocol.CAN_20, outbox=outbox)
 
 
 def open_bus(interface: str, where: str, options: Mapping[str, Any]) -> can.BusABC:

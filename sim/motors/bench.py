@@ -85,6 +85,11 @@ class Bench:
             self._nominal = bitrate
             self.refresh()
 
+    @property
+    def hears(self) -> bool:
+        """Whether any drive has power, and so acknowledges what is sent."""
+        return self._error is not UNACKNOWLEDGED
+
     def drive(self, which: str | int) -> EmulatedDrive:
         """Return a drive by its joint's name or by its present id.
 

@@ -272,6 +272,7 @@ class Cia402Arm(CanArm):
                     self._passenger.disable()
         except (DriveError, DrivesError):
             self._verified = False
+            self._require_open().purge()
             raise
 
     def clear_faults(self) -> None:

@@ -103,12 +103,13 @@ class DamiaoArm(CanArm):
         Raises:
             DriveError: if one drive is not as it should be.
             DrivesError: if several are, or one in several ways; it holds them all.
-            BusError: if the bus is gone.
+            BusError: if the bus is gone, nobody is on it, or old frames were sent.
         """
         transport = self._require_open()
         self._verified = False
         self.warnings.clear()
         self.identities.clear()
+        transport.prove_empty(self._drives[0].question, {drive.id for drive in self._drives})
         others = Eavesdropper()
         transport.listener = others
         problems: list[DriveError] = []
@@ -173,8 +174,8 @@ class DamiaoArm(CanArm):
         transport = self._require_open()
         transport.drain()
         now = self._clock.now_ns()
-        if self._verified and not self._enabled and now - self._polled_ns >= _POLL_PERIOD_NS:
-            self._poll(transport, now)
+        if self._verified and not self._enabled and now - self._polled_ns >= _POLL_PERIOD_NS and not transport.waiting:
+            self._poll(transport, now)  # one round may wait for an arm without power, not one after the other
         joints = self._joints
         enabled = True
         faults: tuple[Fault, ...] = ()
@@ -236,7 +237,7 @@ class DamiaoArm(CanArm):
             # The replies are there already: stamp them now, not one tick later.
             transport.drain()
         if count < len(frames):
-            text = f"{len(frames) - count} frames were not sent: the transmit queue is full"
+            text = f"{len(frames) - count} frames were not sent: nothing leaves, or the transmit queue is full"
             return Sent(command, text, delivered=False)
         for drive in joints:
             if drive.saturated or drive.status != 1:
@@ -269,6 +270,7 @@ class DamiaoArm(CanArm):
             switch_off(self._drives, self._require_open())
         except (DriveError, DrivesError):
             self._verified = False
+            self._require_open().purge()
             raise
 
     def clear_faults(self) -> None:

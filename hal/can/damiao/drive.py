@@ -286,9 +286,14 @@ class Drive:
                 return
         raise self.silent()
 
+    @property
+    def question(self) -> tuple[int, bytes]:
+        """The frame (id, data) that asks for feedback and changes nothing."""
+        return BROADCAST_ID, encode_register(self.id, RegisterCommand.REFRESH)
+
     def poll(self) -> bool:
         """Ask for feedback without waiting; return whether the request left the host."""
-        return self._transport.send(BROADCAST_ID, encode_register(self.id, RegisterCommand.REFRESH))
+        return self._transport.send(*self.question)
 
     def special(self, command: Special) -> bool:
         """Send enable, disable or clear-error, and return whether it left the host."""
