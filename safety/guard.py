@@ -8,6 +8,7 @@ command, so the arm is stopped on account of the limit that was passed (P1, P2, 
 import math
 from collections.abc import Callable, Sequence
 
+from robotctl.hal.can.bus_ids import untag
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Sample
 from robotctl.safety.asked import EXACT, Asked, Kind, Refusal, Step
@@ -115,7 +116,8 @@ class Guard:
                 joint = self._wire.joints[kind]
                 motions.append((kind, joint.asked(data, self._measured[kind][0]), joint.step))
             elif kind is None:
-                text = f"frame {arbitration_id:03X}#{data.hex()} is not on the list of this arm"
+                bus, wire_id = untag(arbitration_id)
+                text = f"frame {wire_id:03X}#{data.hex()} is not on the list of this arm" + (f", bus {bus}" * bool(bus))
                 return self._refuse(Refusal(Protection.FRAMES, text))
             else:
                 refusal = self._permit(kind)

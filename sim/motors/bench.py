@@ -35,20 +35,30 @@ _Handler = Callable[[bytes, int], bytes | None]
 
 
 class Bench:
-    """All drives of a robot profile, powered up, in the plant's home pose.
+    """All drives of a robot profile that are on one bus, powered up, in the plant's home pose.
 
     `replies` fills with what the drives answer, `errors` with what went wrong on the wire; whoever runs the bus takes
     it from there.
     """
 
-    def __init__(self, robot: Robot, start_ns: int = 0, fd: bool | None = None, seed: int = 0) -> None:
-        """Build the plant and the drives.
+    def __init__(
+        self,
+        robot: Robot,
+        start_ns: int = 0,
+        fd: bool | None = None,
+        seed: int = 0,
+        bus: int = 0,
+        plant: Plant | None = None,
+    ) -> None:
+        """Build the plant, unless there is one already, and the drives.
 
         Args:
             robot: whose drives.
             start_ns: the present time.
             fd: whether the drives are set to CAN FD; None for what the profile says.
             seed: of measurement noise and trouble.
+            bus: which of the robot's buses.
+            plant: that of its other buses; see `shared_plant`.
 
         Raises:
             ConfigError: if the robot has no CAN drives.
@@ -56,7 +66,7 @@ class Bench:
         profile = robot.profile
         if profile.can is None:
             raise ConfigError(f"robot {profile.name!r} has no CAN drives to emulate", "use panda or openarm")
-        self.plant = Plant(robot, start_ns)
+        self.plant = plant or Plant(robot, start_ns)
         self.replies: deque[Reply] = deque()
         self.errors: deque[ErrorFrame] = deque(maxlen=_ERRORS)
         """What the host's controller would tell of the frames that it sent."""
@@ -70,7 +80,7 @@ class Bench:
         self._next_ns = FOREVER
         self._routes: dict[int, list[tuple[DamiaoDrive, _Handler]]] = {}
         self._servos: list[DamiaoDrive] = []
-        for axis, (name, wiring, shaft) in enumerate(_shafts(profile, self.plant)):
+        for axis, name, wiring, shaft in _shafts(profile, self.plant, bus):
             mode = ControlMode.MIT if axis < robot.dof else ControlMode.POS_FORCE
             timeout = round(WATCHDOG_SHARE * profile.safety.drive_timeout_s / TIMEOUT_UNIT_S)
             values = factory_values(
@@ -116,6 +126,21 @@ class Bench:
         names = ", ".join(f"{drive.name} ({drive.id})" for drive in self.drives)
         raise ConfigError(f"no motor {which!r}", f"use one of {names}")
 
+    @property
+    def due_ns(self) -> int:
+        """When something falls due next."""
+        return self._next_ns
+
+    @property
+    def is_servoing(self) -> bool:
+        """Whether a drive's own loop has to be stepped with the physics."""
+        return bool(self._servos)
+
+    def step_servos(self) -> None:
+        """Run the drives' own loops for one step of the physics."""
+        for drive in self._servos:
+            drive.step(_STEP_S)
+
     def advance(self, to_ns: int) -> None:
         """Let time pass until `to_ns`; everything that falls due on the way happens at its own time."""
         while self._next_ns <= to_ns:
@@ -159,8 +184,7 @@ class Bench:
             return
         plant = self.plant
         while plant.time_ns + PHYSICS_STEP_NS <= to_ns:
-            for drive in self._servos:
-                drive.step(_STEP_S)
+            self.step_servos()
             plant.advance(plant.time_ns + PHYSICS_STEP_NS)
 
     def _happen(self, now: int) -> None:
@@ -291,19 +315,19 @@ class Troubles:
         return [drive for drive in self._bench.drives if trouble.motor_id in (None, drive.id)]
 
 
-def _shafts(profile: RobotProfile, plant: Plant) -> list[tuple[str, Drive, Shaft]]:
-    """Return joint name, wiring and shaft of every motor, in the order of the plant's axes."""
+def _shafts(profile: RobotProfile, plant: Plant, bus: int) -> list[tuple[int, str, Drive, Shaft]]:
+    """Return axis of the plant, joint name, wiring and shaft of every motor on a bus, in the order of the axes."""
     found = []
     for axis, joint in enumerate(profile.joints):
         wiring = joint.drive
-        if wiring is not None:
+        if wiring is not None and wiring.bus == bus:
             gains = joint.gains
             shaft = Shaft(plant, axis, wiring.sign * wiring.gear, wiring.offset, gains.kp, gains.kd)
-            found.append((joint.name, wiring, shaft))
+            found.append((axis, joint.name, wiring, shaft))
     gripper = profile.gripper
-    if gripper and gripper.drive:
+    if gripper and gripper.drive and gripper.drive.bus == bus:
         finger = gripper.fingers[0]
-        scale = profile.gripper.motor_open / (finger.open - finger.closed) if profile.gripper else 1.0
+        scale = gripper.motor_open / (finger.open - finger.closed)
         shaft = Shaft(plant, plant.dof, scale, finger.closed, gripper.gains.kp, gripper.gains.kd)
-        found.append(("gripper", gripper.drive, shaft))
+        found.append((plant.dof, "gripper", gripper.drive, shaft))
     return found

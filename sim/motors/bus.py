@@ -5,6 +5,8 @@ So the same bus runs in real time and in lockstep, and the same calls at the sam
 """
 
 from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
 
 import can
 
@@ -12,6 +14,7 @@ from robotctl.hal.can.channel import Channel
 from robotctl.hal.clock import Clock
 from robotctl.hal.robot import Robot
 from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.shared_plant import SharedPlant
 
 _POLL_NS = 1_000_000
 
@@ -19,7 +22,10 @@ _POLL_NS = 1_000_000
 class EmulatedBus(can.BusABC):  # type: ignore[misc]
     """The bus between a host and the drives of a `Bench`. Replies of CAN FD are lost unless `fd`."""
 
-    def __init__(self, bench: Bench, clock: Clock, fd: bool = True) -> None:
+    def __init__(
+        self, bench: Bench, clock: Clock, fd: bool = True, advance: Callable[[int], None] | None = None
+    ) -> None:
+        """Take the drives; `advance` lets time pass until a time in ns, by default for this bus alone."""
         super().__init__(channel="emulated")
         self.channel_info = "emulated drives"
         self.bench = bench
@@ -30,7 +36,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         self._fd = fd
         self._clock = clock
         self._now = clock.now_ns
-        self._advance = bench.advance
+        self._advance = advance or bench.advance
         self._receive = bench.receive
         self._replies = bench.replies
         self._wire_errors = bench.errors
@@ -91,9 +97,16 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
 def open_emulated(robot: Robot, clock: Clock) -> Channel:
     """Return the emulated drives of a robot. Entry point `emulated` of the group `robotctl.channels`.
 
+    Where they are on several buses, the first one's channel holds the others.
+
     Raises:
         ConfigError: if the robot has no CAN drives.
     """
-    bench = Bench(robot, clock.now_ns())
     fd = robot.profile.can is not None and robot.profile.can.fd
-    return Channel(EmulatedBus(bench, clock, fd), fd, truth=bench.plant.truth, simulated=True)
+    if robot.profile.buses == 1:
+        bench = Bench(robot, clock.now_ns())
+        return Channel(EmulatedBus(bench, clock, fd), fd, truth=bench.plant.truth, simulated=True)
+    shared = SharedPlant(robot, clock.now_ns())
+    buses = [EmulatedBus(bench, clock, fd, shared.advance) for bench in shared.benches]
+    first, *others = (Channel(bus, fd, truth=bus.bench.plant.truth, simulated=True) for bus in buses)
+    return replace(first, others=tuple(others))

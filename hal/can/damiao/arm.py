@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from robotctl.hal.arm import Arm, Inspector
+from robotctl.hal.can.bandwidth import require_bandwidth
 from robotctl.hal.can.channel import Channel, is_shared, open_channel, reopen_channel
 from robotctl.hal.can.damiao.codec import KD_MAX, KP_MAX, Special, Status
 from robotctl.hal.can.damiao.drive import CONFIRM_TIMEOUT_S, TRIES, Drive, DrivesError, Identity, raise_problems
@@ -116,6 +117,10 @@ class DamiaoArm(Arm):
         if not self._open:
             self._use(open_channel(self._name, self._robot, self._clock))
 
+    def connect_to(self, channel: Channel) -> None:
+        """As `connect`, on a channel that is open already."""
+        self._use(channel)
+
     def _use(self, channel: Channel) -> None:
         if isinstance(self._clock, VirtualClock) and not channel.simulated:
             channel.bus.shutdown()
@@ -123,6 +128,11 @@ class DamiaoArm(Arm):
                 f"the drives behind {self._name!r} live in real time, which lockstep outruns: they would move too fast",
                 "leave out --fast, or use --channel emulated",
             )
+        try:
+            require_bandwidth(self._name, len(self._specs), self._robot.profile.servo_hz, self._can, channel.fd)
+        except ConfigError:
+            channel.bus.shutdown()
+            raise
         transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
         if self._inspector is not None:
             transport.inspector = self._inspector.frames
@@ -269,27 +279,41 @@ class DamiaoArm(Arm):
 
         While the drives are off nothing is sent, but the effort is remembered: `enable` holds with it.
         """
-        transport = self._require_open()
+        self._require_open()
         self._feed_forward = command.effort
         if not self._enabled:
             return Sent(command, "drives are off")
-        joints = self._joints
-        mode, position, velocity, effort = command
         try:
-            if mode == CommandMode.TRACK:
-                targets, speeds = position.tolist(), velocity.tolist()
-            else:
-                # kp is 0, so the angle has no effect; the measured one is what a reader of the log expects.
-                targets, speeds = [drive.position for drive in joints], self._still
-            frames = [
-                (drive.id, drive.encode(q, dq, torque, gains))
-                for drive, q, dq, torque, gains in zip(
-                    joints, targets, speeds, effort.tolist(), self._gains[mode], strict=True
-                )
-            ]
+            frames = self.encode(command)
         except (ValueError, OverflowError):
             text = "not sent: a value is not finite, or there are not as many as joints"
             return Sent(command, text, delivered=False)
+        return self.send(command, frames)
+
+    def encode(self, command: Command) -> list[tuple[int, bytes]]:
+        """Return the frames (id, data) of a command, one per joint.
+
+        Raises:
+            ValueError, OverflowError: if a value is not finite, or there are not as many as joints.
+        """
+        joints = self._joints
+        mode, position, velocity, effort = command
+        if mode == CommandMode.TRACK:
+            targets, speeds = position.tolist(), velocity.tolist()
+        else:
+            # kp is 0, so the angle has no effect; the measured one is what a reader of the log expects.
+            targets, speeds = [drive.position for drive in joints], self._still
+        return [
+            (drive.id, drive.encode(q, dq, torque, gains))
+            for drive, q, dq, torque, gains in zip(
+                joints, targets, speeds, effort.tolist(), self._gains[mode], strict=True
+            )
+        ]
+
+    def send(self, command: Command, frames: Sequence[tuple[int, bytes]]) -> Sent:
+        """Send what `encode` made of a command to drives that are on; the rest of `write`."""
+        transport, joints = self._require_open(), self._joints
+        self._feed_forward = command.effort
         now = self._clock.now_ns()
         count = transport.send_all(frames)
         if transport.refusal:
@@ -316,8 +340,12 @@ class DamiaoArm(Arm):
         Raises:
             BusError: if the bus is gone.
         """
+        return self.write(self.holding())
+
+    def holding(self) -> Command:
+        """Return what holds the measured pose, with the effort of the latest command as feed-forward."""
         position = np.array([drive.position for drive in self._joints])
-        return self.write(Command(CommandMode.TRACK, position, self._zeros, self._feed_forward))
+        return Command(CommandMode.TRACK, position, self._zeros, self._feed_forward)
 
     def disable(self) -> None:
         """Take the torque away from every drive, the gripper's too. Resent up to ten times until confirmed.
