@@ -33,6 +33,7 @@ GROWTH_MB = 10.0
 
 _LOOK_EVERY = 10_000
 """Ticks."""
+_SETTLE_S = 0.05
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -85,11 +86,14 @@ def endure(
     rng = np.random.default_rng(seed)
     act = random(robot, rng)
     with LockstepSession(robot, "can") as session:
-        session.prepare()
-        session.begin()
         bus = emulated_bus(session._rig.arm)
         assert bus is not None
-        bus.bench.trouble.add(BadBus(share=share, dice=Random(seed)))
+        bus.bench.plant.place(np.array(robot.profile.home))
+        session.advance(_SETTLE_S)
+        session.prepare()
+        session.begin()
+        trouble = BadBus(share=share, dice=Random(seed))
+        bus.bench.trouble.add(trouble)
         begun, done, seq = session.statistics.ticks, 0, 0
         while done < ticks and session.state is State.RUN:
             seq += 1
@@ -100,6 +104,7 @@ def endure(
                 looks.append(_look(done))
                 if on_look is not None:
                     on_look(looks[-1])
+        bus.bench.trouble.remove(trouble)
         session.bring_to_rest(Verb.DISARM)
         statistics = session.bus_statistics() or {}
         stops = [f"{trip['protection']}: {trip['text']}" for trip in session.trips]

@@ -19,7 +19,7 @@ from robotctl.hal.can.damiao.drive import Drive
 from robotctl.hal.can.damiao.motors import MOTORS
 from robotctl.hal.can.transport import SEND_TIMEOUT_S, Transport
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import ConfigError
+from robotctl.hal.errors import BusError, ConfigError
 from robotctl.hal.robot import Robot
 
 STAGES = ("encode", "send", "first reply", "last reply", "decode")
@@ -45,6 +45,7 @@ def bench_bus(robot: Robot, clock: Clock, channel: Channel, cycles: int) -> dict
     Raises:
         DriveError: if a drive does not answer.
         ConfigError: if one is enabled, or the robot has none.
+        BusError: if frames cannot be sent.
     """
     wiring = robot.profile.can
     if wiring is None:
@@ -67,7 +68,10 @@ def bench_bus(robot: Robot, clock: Clock, channel: Channel, cycles: int) -> dict
         for one in (bare.cycle, ours.cycle, ours.staged):
             clock.sleep_until(clock.now_ns() + period_ns)
             transport.drain()  # lets an emulated plant catch up, which is not to be timed
-            spans.append(one())
+            try:
+                spans.append(one())
+            except can.CanError as error:
+                raise BusError(f"python-can could not send: {error}", "does whoever answers keep up?") from error
         if cycle >= 0:
             spent[cycle], stages[cycle] = spans[:2], ours.stages
         else:
