@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from robotctl.hal.arm import Arm, Inspector
+from robotctl.hal.can.bandwidth import require_bandwidth
 from robotctl.hal.can.channel import Channel, is_shared, open_channel, reopen_channel
 from robotctl.hal.can.tap import Tap
 from robotctl.hal.can.transport import Transport
@@ -80,6 +81,14 @@ class CanArm(Arm):
         if not self._open:
             self._use(open_channel(self._name, self._robot, self._clock))
 
+    def connect_to(self, channel: Channel) -> None:
+        """As `connect`, on a channel that is open already.
+
+        Raises:
+            ConfigError: as `connect` does; the channel is shut down then.
+        """
+        self._use(channel)
+
     def take_over(self, command: Command) -> None:
         """Take drives that another process had enabled; see `Arm.take_over`.
 
@@ -139,6 +148,12 @@ class CanArm(Arm):
                 f"the drives behind {self._name!r} live in real time, which lockstep outruns: they would move too fast",
                 "leave out --fast, or use --channel emulated",
             )
+        profile = self._robot.profile
+        try:
+            require_bandwidth(self._name, profile.drives, profile.servo_hz, self._can, channel.fd)
+        except ConfigError:
+            channel.bus.shutdown()
+            raise
         transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
         if self._inspector is not None:
             transport.inspector = self._inspector.frames

@@ -6,6 +6,8 @@ So the same bus runs in real time and in lockstep, and the same calls at the sam
 
 import errno
 from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
 
 import can
 
@@ -14,6 +16,7 @@ from robotctl.hal.can.error_frames import ERROR_CONTROLLER, PASSIVE_DATA, RECOVE
 from robotctl.hal.clock import Clock
 from robotctl.hal.robot import Robot
 from robotctl.sim.motors.bench import Bench
+from robotctl.sim.motors.shared_plant import SharedPlant
 
 _POLL_NS = 1_000_000
 
@@ -42,7 +45,10 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
     Replies of CAN FD are lost unless `fd`. While no drive has power, or somebody else keeps the bus, frames wait.
     """
 
-    def __init__(self, bench: Bench, clock: Clock, fd: bool = True) -> None:
+    def __init__(
+        self, bench: Bench, clock: Clock, fd: bool = True, advance: Callable[[int], None] | None = None
+    ) -> None:
+        """Take the drives; `advance` lets time pass until a time in ns, by default for this bus alone."""
         super().__init__(channel="emulated")
         self.channel_info = "emulated drives"
         self.bench = bench
@@ -59,7 +65,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         self._fd = fd
         self._clock = clock
         self._now = clock.now_ns
-        self._advance = bench.advance
+        self._advance = advance or bench.advance
         self._receive = bench.receive
         self._replies = bench.replies
         self._wire_errors = bench.errors
@@ -167,10 +173,18 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
 def open_emulated(robot: Robot, clock: Clock) -> Channel:
     """Return the emulated drives of a robot. Entry point `emulated` of the group `robotctl.channels`.
 
+    Where they are on several buses, the first one's channel holds the others.
+
     Raises:
         ConfigError: if the robot has no CAN drives.
     """
-    bench = Bench(robot, clock.now_ns())
     fd = robot.profile.can is not None and robot.profile.can.fd
-    bus = EmulatedBus(bench, clock, fd)
-    return Channel(bus, fd, truth=bench.plant.truth, simulated=True, outbox=bus)
+    if robot.profile.buses == 1:
+        return _channel(EmulatedBus(Bench(robot, clock.now_ns()), clock, fd), fd)
+    shared = SharedPlant(robot, clock.now_ns())
+    first, *others = (_channel(EmulatedBus(bench, clock, fd, shared.advance), fd) for bench in shared.benches)
+    return replace(first, others=tuple(others))
+
+
+def _channel(bus: EmulatedBus, fd: bool) -> Channel:
+    return Channel(bus, fd, truth=bus.bench.plant.truth, simulated=True, outbox=bus)

@@ -203,27 +203,41 @@ class DamiaoArm(CanArm):
 
         While the drives are off nothing is sent, but the effort is remembered: `enable` holds with it.
         """
-        transport = self._require_open()
+        self._require_open()
         self._feed_forward = command.effort
         if not self._enabled:
             return Sent(command, "drives are off")
-        joints = self._joints
-        mode, position, velocity, effort = command
         try:
-            if mode == CommandMode.TRACK:
-                targets, speeds = position.tolist(), velocity.tolist()
-            else:
-                # kp is 0, so the angle has no effect; the measured one is what a reader of the log expects.
-                targets, speeds = [drive.position for drive in joints], self._still
-            frames = [
-                (drive.id, drive.encode(q, dq, torque, gains))
-                for drive, q, dq, torque, gains in zip(
-                    joints, targets, speeds, effort.tolist(), self._gains[mode], strict=True
-                )
-            ]
+            frames = self.encode(command)
         except (ValueError, OverflowError):
             text = "not sent: a value is not finite, or there are not as many as joints"
             return Sent(command, text, delivered=False)
+        return self.send(command, frames)
+
+    def encode(self, command: Command) -> list[tuple[int, bytes]]:
+        """Return the frames (id, data) of a command, one per joint.
+
+        Raises:
+            ValueError, OverflowError: if a value is not finite, or there are not as many as joints.
+        """
+        joints = self._joints
+        mode, position, velocity, effort = command
+        if mode == CommandMode.TRACK:
+            targets, speeds = position.tolist(), velocity.tolist()
+        else:
+            # kp is 0, so the angle has no effect; the measured one is what a reader of the log expects.
+            targets, speeds = [drive.position for drive in joints], self._still
+        return [
+            (drive.id, drive.encode(q, dq, torque, gains))
+            for drive, q, dq, torque, gains in zip(
+                joints, targets, speeds, effort.tolist(), self._gains[mode], strict=True
+            )
+        ]
+
+    def send(self, command: Command, frames: Sequence[tuple[int, bytes]]) -> Sent:
+        """Send what `encode` made of a command to drives that are on; the rest of `write`."""
+        transport, joints = self._require_open(), self._joints
+        self._feed_forward = command.effort
         now = self._clock.now_ns()
         count = transport.send_all(frames)
         if transport.refusal:
@@ -250,8 +264,12 @@ class DamiaoArm(CanArm):
         Raises:
             BusError: if the bus is gone.
         """
+        return self.write(self.holding())
+
+    def holding(self) -> Command:
+        """Return what holds the measured pose, with the effort of the latest command as feed-forward."""
         position = np.array([drive.position for drive in self._joints])
-        return self.write(Command(CommandMode.TRACK, position, self._zeros, self._feed_forward))
+        return Command(CommandMode.TRACK, position, self._zeros, self._feed_forward)
 
     def disable(self) -> None:
         """Take the torque away from every drive, the gripper's too. Resent up to ten times until confirmed.
