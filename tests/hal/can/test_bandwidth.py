@@ -41,6 +41,12 @@ def test_what_does_not_fit_is_refused_with_the_highest_rate(drives, fd, hz, why)
         require_bandwidth("socketcan:can0", [DRIVE] * drives, hz, WIRING, fd)
 
 
+def test_cia_402_drives_take_and_give_two_frames_each_and_share_one_sync():
+    seven = load_robot("xarm7").profile.drives
+    assert cycle_s(seven, WIRING, fd=False) == pytest.approx(3.415e-3)
+    assert cycle_s([*seven, DRIVE], WIRING, fd=False) == pytest.approx(3.415e-3 + 0.27e-3)
+
+
 def test_a_slow_bus_carries_less():
     assert highest_hz([DRIVE] * 8, CanBus(bitrate=500_000), fd=False) == 208
 

@@ -155,6 +155,19 @@ def test_all_that_is_wrong_on_both_buses_is_told_at_once():
     arm.close()
 
 
+def test_frames_of_one_bus_that_cannot_be_taken_back_do_not_keep_the_other_open(monkeypatch: pytest.MonkeyPatch):
+    arm = open_backend("can", ROBOT, VirtualClock(1_000_000_000)).arm
+    arm.connect()
+
+    def purge() -> None:
+        raise BusError("frames wait", "take the interface down and up")
+
+    monkeypatch.setattr(arm.arms[0]._transport, "purge", purge)
+    with pytest.raises(BusError, match="frames wait"):
+        arm.close()
+    assert [part.channel for part in arm.arms] == [None, None]
+
+
 def test_an_id_tells_its_bus():
     assert untag(tag(3, 0x1FFFFFFF)) == (3, 0x1FFFFFFF)
     assert tag(0, 0x123) == 0x123
