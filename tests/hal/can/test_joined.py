@@ -108,6 +108,24 @@ def test_losing_one_bus_stops_both_arms(session: Session, lost: int):
     assert not any(drive.enabled for drive in session.drives(0) + session.drives(1))
 
 
+def test_one_arm_without_power_stops_both_and_nothing_is_left_to_be_sent_to_it(session: Session):
+    session.move(np.full(14, 0.2), 0.5)
+    bus = session.bus(LEFT_BUS)
+    for drive in session.drives(LEFT_BUS):
+        drive.power_down()
+    session.advance(2 * PERIOD_S)
+    assert session.trips[0]["protection"] == "P14"
+    assert session.state is State.STOPPING
+    session.wait_for(State.DISABLED, State.FAULT, timeout_s=3.0)
+    session.advance(0.5)
+    assert np.abs(session.latest()["true_velocity"][RIGHT]).max() < 1.0
+    assert all(drive.enabled for drive in session.drives(RIGHT_BUS))
+    assert 0 < len(bus._waiting) <= 16  # two cycles and what takes torque away: no command joins frames that wait
+    with suppress(HardwareError):
+        session.close()
+    assert not bus._waiting
+
+
 def test_nothing_of_a_refused_command_leaves_on_either_bus(session: Session):
     guard = session.loop._guard
     before = [session.bus(number).bench.drives[0].fed_ns for number in (0, 1)]
