@@ -11,6 +11,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from robotctl.cli.bench_bus import bus
+from robotctl.cli.bench_endurance import endurance
 from robotctl.cli.errors import Exit, readable_errors
 from robotctl.cli.output import write_json
 from robotctl.control.benchmark import bench_tick
@@ -20,6 +22,8 @@ from robotctl.trials.cost import MODES, POLICIES, bench_safety
 from robotctl.trials.soak import cases, soak
 
 bench_app = typer.Typer(help="Measure what things cost.", no_args_is_help=True)
+bench_app.command()(bus)
+bench_app.command()(endurance)
 
 
 @bench_app.callback()

@@ -68,7 +68,7 @@ def run(
     hear_interrupts()
     with readable_errors():
         model = load_robot(robot, overrides)
-        if channel.startswith("slcan:") and model.profile.servo_hz > CLASSIC_HZ:
+        if "slcan:" in channel and model.profile.servo_hz > CLASSIC_HZ:
             overrides.append(f"servo_hz={CLASSIC_HZ}")
             model = load_robot(robot, overrides)
             console.print(f"slcan carries classic CAN only: servo rate {CLASSIC_HZ} Hz")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from robotctl.control.frame_ring import FRAME_DTYPE, Flag
 from robotctl.control.recorded import read_recording
 from robotctl.control.recording import FRAMES_TOPIC
+from robotctl.hal.can.bus_ids import untag
 from robotctl.hal.can.cia402.replay import Replayed402
 from robotctl.hal.can.damiao.replay import ReplayedDrives
 from robotctl.hal.errors import ConfigError
@@ -32,6 +33,7 @@ class Frame(NamedTuple):
     stamp_ns: int
     """Monotonic: when it left, or arrived."""
     arbitration_id: int
+    """With its bus; see `hal.can.bus_ids`."""
     data: bytes
     flags: Flag
 
@@ -175,9 +177,10 @@ def export(frames: FrameFile, path: Path) -> int:
 def _message(frame: Frame, offset_ns: int) -> can.Message:
     flags = frame.flags
     fd = bool(flags & Flag.FD)
+    bus, wire_id = untag(frame.arbitration_id)
     return can.Message(
         timestamp=(frame.stamp_ns + offset_ns) * 1e-9,
-        arbitration_id=frame.arbitration_id,
+        arbitration_id=wire_id,
         is_extended_id=bool(flags & Flag.EXTENDED),
         is_error_frame=bool(flags & Flag.ERROR),
         is_remote_frame=bool(flags & Flag.REMOTE),
@@ -185,5 +188,5 @@ def _message(frame: Frame, offset_ns: int) -> can.Message:
         bitrate_switch=fd,
         is_rx=not flags & Flag.SENT,
         data=frame.data,
-        channel="can0",
+        channel=f"can{bus}",
     )

@@ -44,10 +44,9 @@ class Kinematics:
         self._data = self.model.createData()
         self._aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         self._still = np.zeros(self.model.nv)
-        links = [float(np.linalg.norm(joint.translation)) for joint in list(self.model.jointPlacements)[2:]]
-        links.append(float(np.linalg.norm(placement.translation)))
-        self.reach = frozen(np.cumsum(links[::-1])[::-1])
-        """Length of the chain from each joint to the tool point (n,), m: no joint is further from it."""
+        self.reach = frozen(_reach(self.model, carrier.parentJoint, placement))
+        """Length of the chain from each joint to the tool point (n,), m: no joint is further from it. 0 for those that
+        do not move it."""
         self.damping = np.array(self.model.damping)
         """Viscous friction of each joint, Nms/rad."""
         self.friction = np.array(self.model.friction)
@@ -92,6 +91,15 @@ class Kinematics:
         """Return dJ/dt v (3,), m/s^2: how the tool point accelerates while the joint velocities stay constant."""
         pin.forwardKinematics(self.model, self._data, position, velocity, self._still)
         return np.array(pin.getFrameClassicalAcceleration(self.model, self._data, self._tool, self._aligned).linear)
+
+
+def _reach(model: pin.Model, joint: int, tool: pin.SE3) -> Vector:
+    reach, far = np.zeros(model.nv), float(np.linalg.norm(tool.translation))
+    while joint > 0:
+        reach[model.idx_vs[joint]] = far
+        far += float(np.linalg.norm(model.jointPlacements[joint].translation))
+        joint = model.parents[joint]
+    return reach
 
 
 def locked(robot: Robot, full: pin.Model, opening: float) -> tuple[list[int], Vector]:

@@ -98,6 +98,10 @@ def _run(loop: Loop, link: Link, clock: MonotonicClock, config: ProcessConfig) -
         try:
             if not (link.watch.beats and link.watch.power is Power.ON):  # else the watchman brings the arm down gently
                 loop.shut_down()
+        except RobotctlError as error:
+            text = f"the arm was not left as it should be: {error}"
+            link.events.write({"type": "error", "stamp_ns": clock.now_ns(), "kind": "hardware", "text": text})
+            return 4
         finally:
             link.events.write({"type": "bus", "stamp_ns": clock.now_ns(), "statistics": statistics})
     return 0

@@ -20,7 +20,7 @@ from robotctl.control.session import Session, Stopped, frame_slots, history_slot
 from robotctl.control.shared import Link
 from robotctl.control.task_reset import Step, dump
 from robotctl.control.watchman import LONGEST_RESCUE_S, WatchmanConfig
-from robotctl.hal.can.channel import is_shared
+from robotctl.hal.can.channel import is_shared, split_channels
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.errors import ConfigError, HardwareError
 from robotctl.hal.robot import Robot
@@ -56,7 +56,7 @@ class ProcessSession(Session):
         self._reset = list(reset)
         self._process: subprocess.Popen[bytes] | None = None
         self._watchman: subprocess.Popen[bytes] | None = None
-        self._claim: socket.socket | None = None
+        self._claims: list[socket.socket] = []
         self.rehearsals: list[Rehearsal] = []
         """What the reset routines looked like in the twin, in order."""
         self._bus: dict[str, object] | None = None
@@ -101,9 +101,10 @@ class ProcessSession(Session):
         shared = [mailbox, board]
         frames = [] if self.frames is None or self.frames.fd is None else [self.frames.fd]
         if is_shared(self._channel):
-            # Inherited, so that the channel is taken for as long as any of the three processes lives.
-            self._claim = registry.claim(self._channel)
-            shared.append(self._claim.fileno())
+            # Inherited, so that the channels are taken for as long as any of the three processes lives.
+            for one in split_channels(self._channel):
+                self._claims.append(registry.claim(one))
+                shared.append(self._claims[-1].fileno())
         self._process = subprocess.Popen(
             [sys.executable, "-m", "robotctl.control.process", config.to_json()],
             pass_fds=[*shared, *frames],
@@ -164,8 +165,8 @@ class ProcessSession(Session):
             self._await_watchman()
             self.poll()
         self._complaints.close()
-        if self._claim is not None:
-            self._claim.close()
+        for claim in self._claims:
+            claim.close()
         if self.link.fds is not None:
             for fd in self.link.fds:
                 os.close(fd)
@@ -219,7 +220,10 @@ class ProcessSession(Session):
         if event["type"] == "bus":
             self._bus = event["statistics"]
         elif event["type"] == "error":
-            self._error = event
+            # A second one tells what the first has left behind.
+            self._error = (
+                event if self._error is None else self._error | {"text": f"{self._error['text']}\n{event['text']}"}
+            )
         elif (
             event["type"] == "trip" and event["protection"] == Protection.WATCHMAN.label and not event["stop_category"]
         ):

@@ -8,12 +8,12 @@ import json
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from robotctl.hal.can.channel import is_shared
+from robotctl.hal.can.channel import is_shared, split_channels
 from robotctl.hal.errors import BusError
 
 
@@ -84,12 +84,14 @@ def claim(channel: str) -> socket.socket:
 
 @contextmanager
 def claimed(channel: str) -> Iterator[None]:
-    """Have a channel for this process alone, if others can reach what is behind it.
+    """Have a channel, or several with commas between them, for this process alone, if others can reach what is there.
 
     Raises:
         BusError: if another process has it.
     """
-    with claim(channel) if is_shared(channel) else nullcontext():
+    with ExitStack() as stack:
+        for one in split_channels(channel) if is_shared(channel) else ():
+            stack.enter_context(claim(one))
         yield
 
 

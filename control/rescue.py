@@ -52,9 +52,14 @@ class Rescue:
             legacy.log("the watchman has switched the drives off, and they have confirmed it")
         except RobotctlError as error:
             legacy.log(f"the watchman could not switch the drives off: {error}")
-        finally:
-            self._arm.close()
+        self._release(legacy)
         legacy.tick(State.FAULT)
+
+    def _release(self, legacy: Legacy) -> None:
+        try:
+            self._arm.close()
+        except RobotctlError as error:
+            legacy.log(f"the bus was not left as it should be: {error}")
 
     def _lower(self, legacy: Legacy, began_ns: int) -> None:
         """Damp the arm, and lower it, as long as all its drives are on and heard of."""

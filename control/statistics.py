@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from robotctl.safety.shaper import Clip
 
+REMEMBERED = 300_000
+"""Ticks whose durations and lateness are kept for percentiles: ten minutes at 500 Hz."""
+
 
 def percentiles_us(nanoseconds: NDArray[Any]) -> dict[str, float] | None:
     """Return p50, p99, p999 and max in microseconds; None without data."""
@@ -21,13 +24,36 @@ def percentiles_us(nanoseconds: NDArray[Any]) -> dict[str, float] | None:
     }
 
 
+class Tail:
+    """The latest values of a series that has no end."""
+
+    def __init__(self) -> None:
+        self._values = np.empty(0, dtype=np.int64)
+        self._count = 0
+
+    def take(self, values: NDArray[Any]) -> None:
+        """Add values, forgetting the oldest beyond `REMEMBERED`."""
+        if self._count + len(values) > len(self._values):
+            kept = self.values[-REMEMBERED:]
+            self._values = np.empty(2 * (len(kept) + len(values)), dtype=np.int64)
+            self._values[: len(kept)] = kept
+            self._count = len(kept)
+        self._values[self._count : self._count + len(values)] = values
+        self._count += len(values)
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """The latest values, at least `REMEMBERED` of them if there were as many."""
+        return self._values[: self._count]
+
+
 class TickStatistics:
-    """Takes tick records in any portions."""
+    """Takes tick records in any portions. Percentiles are of the latest ten minutes and more, counts of all ticks."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
-        self._durations: list[NDArray[Any]] = []
-        self._lateness: list[NDArray[Any]] = []
+        self._durations = Tail()
+        self._lateness = Tail()
         self.ticks = 0
         self.clipped = 0
         self.overruns = 0
@@ -41,8 +67,8 @@ class TickStatistics:
         self.ticks += dropped
         if not len(records):
             return
-        self._durations.append(records["duration_ns"].copy())
-        self._lateness.append(records["lateness_ns"].copy())
+        self._durations.take(records["duration_ns"])
+        self._lateness.take(records["lateness_ns"])
         self.ticks += len(records)
         self.clipped += int((records["clip"] & ~Clip.RECOVERY != 0).sum())
         self.overruns += int((records["lateness_ns"] > self._period_ns).sum())
@@ -53,12 +79,11 @@ class TickStatistics:
     def report(self) -> dict[str, object]:
         """Return the numbers of the report's `timing` section."""
         elapsed = self._last_ns - (self._first_ns or 0)
-        none = np.empty(0)
         return {
             "ticks": self.ticks,
             "servo_hz": round((self.ticks - 1) / elapsed * 1e9, 2) if elapsed > 0 else 0.0,
             "overruns": self.overruns,
             "dropped": self.dropped,
-            "tick_us": percentiles_us(np.concatenate(self._durations) if self._durations else none),
-            "lateness_us": percentiles_us(np.concatenate(self._lateness) if self._lateness else none),
+            "tick_us": percentiles_us(self._durations.values),
+            "lateness_us": percentiles_us(self._lateness.values),
         }

@@ -17,7 +17,7 @@ class Inspector(Protocol):
     """Has the last word on what leaves for the drives: any text it returns says why that is kept back."""
 
     def frames(self, frames: Sequence[tuple[int, bytes]]) -> str:
-        """Judge encoded CAN frames (id, data) that are about to leave together."""
+        """Judge encoded CAN frames (id, data) that are about to leave together; ids as `hal.can.bus_ids` has them."""
         ...
 
     def command(self, command: Command) -> str:

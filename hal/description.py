@@ -5,7 +5,7 @@ reinterpret goes, joints, inertias and frames stay. Two traps are closed here fo
 
 * a `continuous` joint is two coordinates in Pinocchio and one in MuJoCo, so it becomes `revolute`;
 * Pinocchio keeps only the first body of an MJCF world and drops the others without a word, so an MJCF has to name
-  the one body that is meant.
+  the bodies that are meant, and they become one.
 """
 
 import math
@@ -70,14 +70,14 @@ def locate(package: str, file: str) -> Path:
     return Path(str(found[0].locate())).resolve()
 
 
-def load_description(path: Path, root: str | None = None, *, collision: bool = False) -> Description:
-    """Read and normalise a URDF, or the body `root` of an MJCF.
+def load_description(path: Path, root: str | list[str] | None = None, *, collision: bool = False) -> Description:
+    """Read and normalise a URDF, or the body `root` of an MJCF, or several.
 
     Args:
         collision: keep the geometry that a collision check needs; meshes are named so that they are found.
 
     Raises:
-        ConfigError: if the file is not well-formed, is neither language, or lacks the body.
+        ConfigError: if the file is not well-formed, is neither language, or lacks a body.
     """
     try:
         tree = ET.parse(path).getroot()  # noqa: S314 - the user's own model file
@@ -86,7 +86,7 @@ def load_description(path: Path, root: str | None = None, *, collision: bool = F
     if tree.tag == "robot":
         return _urdf(tree, collision)
     if tree.tag == "mujoco":
-        return _mjcf(tree, path, root, collision)
+        return _mjcf(tree, path, [root] if isinstance(root, str) else root or [], collision)
     raise ConfigError(f"{path}: <{tree.tag}> is neither a URDF nor an MJCF")
 
 
@@ -115,16 +115,17 @@ def _urdf(robot: ET.Element, collision: bool) -> Description:
     return Description(ET.tostring(robot, encoding="unicode"), "urdf", limits)
 
 
-def _mjcf(model: ET.Element, path: Path, root: str | None, collision: bool) -> Description:
+def _mjcf(model: ET.Element, path: Path, roots: list[str], collision: bool) -> Description:
     world = model.find("worldbody")
     bodies = [] if world is None else world.findall("body")
     names = [body.get("name", "") for body in bodies]
-    if world is None or root not in names:
-        raise ConfigError(f"{path}: no body {root!r} under worldbody", f"set model.root to one of {', '.join(names)}")
+    if world is None or not roots or not set(roots) <= set(names):
+        missing = ", ".join(repr(root) for root in roots if root not in names) or None
+        raise ConfigError(f"{path}: no body {missing} under worldbody", f"set model.root to one of {', '.join(names)}")
     for element in list(world):
         world.remove(element)
     # Pinocchio puts a body that stands alone under the world at the origin; inside a fixed root it keeps its place.
-    ET.SubElement(world, "body", name="robotctl_root").append(bodies[names.index(root)])
+    ET.SubElement(world, "body", name="robotctl_root").extend(bodies[names.index(root)] for root in roots)
     for tag in ("actuator", "sensor", "equality", "contact", "tendon", "keyframe", "visual", "statistic"):
         for element in model.findall(tag):
             model.remove(element)

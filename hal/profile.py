@@ -33,8 +33,8 @@ class ModelSource(_Strict):
     """Distribution that ships the file, or empty for a path of your own."""
     file: str
     """Path, or the end of the path inside the distribution."""
-    root: str | None = None
-    """MJCF only: the body under `worldbody` that carries the arm."""
+    root: str | list[str] | None = None
+    """MJCF only: the body under `worldbody` that carries the arm, or those that carry several, in the file's order."""
 
 
 class Drive(_Strict):
@@ -50,6 +50,8 @@ class Drive(_Strict):
     """Motor turns per joint turn, beyond the gear that the drive itself accounts for."""
     offset: Finite = 0.0
     """Joint angle at the motor's zero, rad."""
+    bus: Annotated[int, Field(strict=True, ge=0, le=7)] = 0
+    """Which of the robot's buses it is on: its place in `--channel`."""
 
 
 class DamiaoDrive(Drive):
@@ -375,6 +377,17 @@ class RobotProfile(_Strict):
         drive = self.joints[0].drive
         return drive.protocol if drive is not None else ""
 
+    @property
+    def drives(self) -> list[AnyDrive]:
+        """Every drive, the gripper's last."""
+        wirings = [joint.drive for joint in self.joints] + [self.gripper.drive if self.gripper else None]
+        return [wiring for wiring in wirings if wiring is not None]
+
+    @property
+    def buses(self) -> int:
+        """How many buses the drives are on; 1 without any."""
+        return 1 + max((drive.bus for drive in self.drives), default=0)
+
     payload: NotNegative = 0.0
     """Mass at the tool point that is known, kg; gravity and inertia of the arm's model include it."""
 
@@ -388,12 +401,14 @@ class RobotProfile(_Strict):
             for value, joint in zip(pose, self.joints, strict=True):
                 if not joint.position[0] < value < joint.position[1]:
                     raise ValueError(f"{key}: {joint.name} at {value} rad is outside its limits {joint.position}")
-        ids = [joint.drive.id for joint in self.joints if joint.drive]
-        if self.gripper and self.gripper.drive:
-            ids.append(self.gripper.drive.id)
-        twice = {motor for motor in ids if ids.count(motor) > 1}
+        ids = [(drive.bus, drive.id) for drive in self.drives]
+        twice = {motor for bus, motor in ids if ids.count((bus, motor)) > 1}
         if twice:
-            raise ValueError(f"drive.id: {sorted(twice)} used by more than one motor")
+            raise ValueError(f"drive.id: {sorted(twice)} used by more than one motor of a bus")
+        if {bus for bus, _ in ids} != set(range(self.buses if ids else 0)):
+            raise ValueError(
+                f"drive.bus: buses are counted from 0 without a gap, got {sorted({bus for bus, _ in ids})}"
+            )
         near = self.safety.proximity_stop + self.safety.proximity_margin
         if near >= self.safety.proximity_slow:
             raise ValueError(f"safety.proximity_slow: not beyond proximity_stop and proximity_margin ({near} m)")

@@ -62,6 +62,18 @@ class Robot:
     def dof(self) -> int:
         return len(self.profile.joints)
 
+    def on_bus(self, bus: int) -> "Robot":
+        """Return the part of this robot whose drives are on one of its buses: those joints, and the gripper if it is.
+
+        It is for drivers: regions, tool and poses are still the whole robot's.
+        """
+        profile = self.profile
+        joints = [joint for joint in profile.joints if joint.drive and joint.drive.bus == bus]
+        gripper = profile.gripper
+        here = gripper is not None and gripper.drive is not None and gripper.drive.bus == bus
+        part = profile.model_copy(update={"joints": joints, "gripper": gripper if here else None})
+        return Robot(part, self.description, Limits.of(joints), self.source)
+
     @property
     def period_ns(self) -> int:
         """Servo period."""

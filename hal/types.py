@@ -46,6 +46,8 @@ class Sample(NamedTuple):
     """Hottest part of each drive, degrees Celsius; None where the drives do not tell."""
     rejected: int = 0
     """Frames refused since connecting: on a drive's id, but of a wrong length or not decodable."""
+    cut_off: tuple[int, ...] = ()
+    """Joints behind a bus that is gone while others are there; `enabled` and `faults` do not count them."""
 
 
 class CommandMode(IntEnum):

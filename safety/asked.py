@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from enum import Enum, auto
 from typing import NamedTuple, Protocol
 
+from robotctl.hal.can.bus_ids import untag
 from robotctl.safety.trip import Protection
 
 
@@ -93,7 +94,8 @@ class Reading(Protocol):
 
 def stranger(arbitration_id: int, data: bytes) -> str:
     """Return why a frame may not leave that no reading knows."""
-    return f"frame {arbitration_id:03X}#{data.hex()} is not on the list of this arm"
+    bus, wire_id = untag(arbitration_id)
+    return f"frame {wire_id:03X}#{data.hex()} is not on the list of this arm" + (f", bus {bus}" if bus else "")
 
 
 class Refusal(NamedTuple):

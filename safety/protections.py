@@ -73,14 +73,18 @@ class FeedbackAge:
         """Whether not one joint is heard of: the drives have no power."""
 
     def check(self, sample: Sample, now_ns: int) -> Trip | None:
-        age = now_ns - int(sample.joint_stamp_ns.min())
+        stamps = sample.joint_stamp_ns
+        if sample.cut_off:  # P14 stops the arm for them; of the others enough is known to brake and to lower them
+            stamps = stamps.copy()
+            stamps[list(sample.cut_off)] = now_ns
+        age = now_ns - int(stamps.min())
         self.stale = age > self._stop_ns
         self.lost = age > self._fault_ns
         self.dead = now_ns - int(sample.joint_stamp_ns.max()) > self._fault_ns
         if not self.lost:
             return None
-        joint = int(sample.joint_stamp_ns.argmin())
-        heard = int(sample.joint_stamp_ns[joint])
+        joint = int(stamps.argmin())
+        heard = int(stamps[joint])
         cause = (
             f"{self._names[joint]} has not answered for {age / 1e6:.0f} ms; "
             "check its power, its connector and the bus, then acknowledge"

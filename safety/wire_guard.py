@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 
+from robotctl.hal.can.bus_ids import tag, untag
 from robotctl.hal.can.damiao.codec import (
     BROADCAST_ID,
     KD_MAX,
@@ -63,7 +64,7 @@ class WireGripper:
     """The gripper's motor, in POS_FORCE mode."""
 
     def __init__(self, gripper: GripperProfile, drive: DamiaoDrive) -> None:
-        self.id = drive.id + Offset.POS_FORCE
+        self.id = tag(drive.bus, drive.id + Offset.POS_FORCE)
         per_metre = abs(gripper.motor_open) / gripper.width
         self._least, self._most = sorted((0.0, gripper.motor_open))
         self._speed = gripper.speed * per_metre
@@ -79,17 +80,17 @@ class WireGripper:
 
 
 class WireGuard:
-    """Tells the kinds of all messages to an arm's DAMIAO drives."""
+    """Tells the kinds of all messages to an arm's DAMIAO drives, with a list for each bus: see `hal.can.bus_ids`."""
 
     def __init__(self, profile: RobotProfile) -> None:
         drives = [joint.drive for joint in profile.joints if isinstance(joint.drive, DamiaoDrive)]
         self.joints = [WireJoint(drive) for drive in drives]
-        self._index = {drive.id: index for index, drive in enumerate(drives)}
+        self._index = {tag(drive.bus, drive.id): index for index, drive in enumerate(drives)}
         self._motors = set(self._index)
         self._gripper: WireGripper | None = None
         if profile.gripper and isinstance(profile.gripper.drive, DamiaoDrive):
             drive = profile.gripper.drive
-            self._motors.add(drive.id)
+            self._motors.add(tag(drive.bus, drive.id))
             self._gripper = WireGripper(profile.gripper, drive)
 
     def read(
@@ -114,7 +115,8 @@ class WireGuard:
             return self._index.get(arbitration_id)
         if self._gripper is not None and arbitration_id == self._gripper.id:
             return Kind.GRIP if self._gripper.fits(data) else None
-        if arbitration_id == BROADCAST_ID and int.from_bytes(data[:2], "little") in self._motors:
+        bus, wire_id = untag(arbitration_id)
+        if wire_id == BROADCAST_ID and tag(bus, int.from_bytes(data[:2], "little")) in self._motors:
             return _register_kind(data[2], data[3])
         return None
 

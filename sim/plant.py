@@ -191,6 +191,10 @@ def _build(robot: Robot, scene: Scene | None) -> tuple[mujoco.MjModel, list[int]
     spec.option.timestep = PHYSICS_STEP_NS * 1e-9
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     _mark_tool(spec, profile)
+    moved = {joint.name for joint in profile.joints}
+    moved |= {finger.name for finger in profile.gripper.fingers} if profile.gripper else set()
+    for other in [joint for joint in spec.joints if joint.name not in moved]:
+        spec.delete(other)  # as in Pinocchio's model: what the profile does not move stays where it is
     for joint in profile.joints:
         spec.joint(joint.name).armature += joint.armature
         _add_drive(spec, joint.name, joint.torque, profile.twin.lag_s)

@@ -13,6 +13,7 @@ from robotctl.control.shared import Link
 from robotctl.hal.arm import Arm
 from robotctl.hal.backend import Rig, open_backend
 from robotctl.hal.can.arm import CanArm
+from robotctl.hal.can.joined import JoinedArm
 from robotctl.hal.clock import VirtualClock
 from robotctl.hal.errors import HardwareError
 from robotctl.hal.robot import Robot
@@ -37,8 +38,8 @@ Policy = Callable[["Bench", float], Target | None]
 
 
 def emulated_bus(arm: Arm) -> EmulatedBus | None:
-    """Return the emulated bus that an arm is on, if it is on one."""
-    channel = arm.channel if isinstance(arm, CanArm) else None
+    """Return the emulated bus that an arm is on, if it is on one; of several, the first."""
+    channel = arm.channel if isinstance(arm, CanArm | JoinedArm) else None
     return channel.bus if channel is not None and isinstance(channel.bus, EmulatedBus) else None
 
 

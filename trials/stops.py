@@ -53,6 +53,8 @@ class Expected:
     """What else may come first, where it depends on the joint and the motion which threshold is passed first."""
     excused: frozenset[str] = frozenset()
     """Invariants that the fault itself breaks: limits as the judge names them, or `drift`."""
+    words: str = ""
+    """What the trip's text has to hold: what a person can do, mostly."""
     note: str = ""
     """What else has to be known, for the report."""
 
@@ -148,6 +150,7 @@ def judge_trip(trips: Sequence[dict[str, Any]], expected: Expected, trial: Trial
         trial.seen = f"{first['protection']}, category {first['stop_category']}"
         right = (first["protection"], first["stop_category"]) in expected.accepted
         trial.require(right, f"{trial.seen} came first: {first['text']}")
+        trial.require(expected.words in first["text"], f"{trial.seen} said: {first['text']}")
 
 
 def judge_stop(robot: Robot, records: NDArray[Any], onset_ns: int, expected: Expected, trial: Trial) -> None:

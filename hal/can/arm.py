@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from robotctl.hal.arm import Arm, Inspector
+from robotctl.hal.can.bandwidth import require_bandwidth
 from robotctl.hal.can.channel import Channel, is_shared, open_channel, reopen_channel
 from robotctl.hal.can.problems import DrivesError
 from robotctl.hal.can.tap import Tap
@@ -106,6 +107,14 @@ class CanArm(Arm):
         if not self._open:
             self._use(open_channel(self._name, self._robot, self._clock))
 
+    def connect_to(self, channel: Channel) -> None:
+        """As `connect`, on a channel that is open already.
+
+        Raises:
+            ConfigError: as `connect` does; the channel is shut down then.
+        """
+        self._use(channel)
+
     def take_over(self, command: Command) -> None:
         """Take drives that another process had enabled; see `Arm.take_over`.
 
@@ -125,8 +134,12 @@ class CanArm(Arm):
         Raises:
             BusError: if the bus is gone.
         """
+        return self.write(self.holding())
+
+    def holding(self) -> Command:
+        """Return what holds the measured pose, with the effort of the latest command as feed-forward."""
         position = np.array([drive.position for drive in self._joints])
-        return self.write(Command(CommandMode.TRACK, position, self._zeros, self._feed_forward))
+        return Command(CommandMode.TRACK, position, self._zeros, self._feed_forward)
 
     def disable(self) -> None:
         """Take the torque away from every drive, the gripper's too. Resent up to ten times until confirmed.
@@ -145,15 +158,19 @@ class CanArm(Arm):
             self._switch_off()
         except (DriveError, DrivesError):
             self._verified = False
+            self._require_open().purge()
             raise
 
     def close(self) -> None:
         if self.gripper:
             self.gripper.release()
         self._verified = self._enabled = False
-        if self._transport is not None:
-            self._transport.close()
         self._channel = None
+        if self._transport is not None:
+            try:
+                self._transport.purge()
+            finally:
+                self._transport.close()
 
     def truth(self) -> Truth | None:
         channel = self._channel
@@ -211,6 +228,12 @@ class CanArm(Arm):
                 f"the drives behind {self._name!r} live in real time, which lockstep outruns: they would move too fast",
                 "leave out --fast, or use --channel emulated",
             )
+        profile = self._robot.profile
+        try:
+            require_bandwidth(self._name, profile.drives, profile.servo_hz, self._can, channel.fd)
+        except ConfigError:
+            channel.bus.shutdown()
+            raise
         transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
         if self._inspector is not None:
             transport.inspector = self._inspector.frames

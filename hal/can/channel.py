@@ -10,14 +10,16 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
 import can
 
+from robotctl.hal.can.kernel_queue import KernelQueue
+from robotctl.hal.can.outbox import Outbox
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import BusError, ConfigError
+from robotctl.hal.errors import BusError, ConfigError, RobotctlError
 from robotctl.hal.profile import CanBus
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Truth
@@ -41,8 +43,12 @@ class Channel:
     """Whether CAN FD frames pass."""
     truth: Callable[[], Truth] | None = None
     """The true state of the plant behind it, where that is known."""
+    others: tuple["Channel", ...] = ()
+    """The channels of the robot's other buses, where opening one opens them all."""
     simulated: bool = False
     """Whether its time is the clock's that it was opened with, and nothing arrives unless that clock moves."""
+    outbox: Outbox | None = None
+    """What is known of frames that have not left; None where nothing is."""
 
     def close(self) -> bool:
         """Shut the bus down, and return whether that went well; an interface that has vanished cannot be closed.
@@ -66,15 +72,52 @@ _OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NotIm
 """NameError is what some of python-can's interfaces end in where the vendor's library is missing."""
 
 
+def split_channels(name: str) -> list[str]:
+    """Return the channels that a robot on several buses was given, with commas between them."""
+    return name.split(",")
+
+
+def channel_names(name: str, robot: Robot) -> list[str]:
+    """Return what each bus of a robot is called: its own channel's name, or that of the one that opens them all.
+
+    Raises:
+        ConfigError: if there are not as many channels as buses, or the same one twice.
+    """
+    names, buses = split_channels(name), robot.profile.buses
+    if name in _factories():
+        return names * buses
+    if len(names) != buses or len(set(names)) != buses:
+        example = ",".join(f"socketcan:can{bus}" for bus in range(buses))
+        raise ConfigError(
+            f"robot {robot.profile.name!r} is on {buses} {'bus' if buses == 1 else 'buses'}, and --channel {name!r} "
+            f"names {len(set(names))}",
+            f"use --channel {example}" if buses > 1 else "name one channel",
+        )
+    return names
+
+
 def is_shared(name: str) -> bool:
-    """Return whether other processes reach the drives behind a channel, too."""
-    interface, _, where = name.partition(":")
-    private = {entry.name for entry in entry_points(group="robotctl.channels")} | {"virtual"}
-    return bool(where) and interface not in private
+    """Return whether other processes reach the drives behind a channel, or behind one of several, too."""
+    return any(bool(one.partition(":")[2]) and not _is_private(one) for one in split_channels(name))
+
+
+def _is_private(name: str) -> bool:
+    return name.partition(":")[0] in _factories().keys() | {"virtual"}
+
+
+def _factories() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group="robotctl.channels")}
 
 
 def may_be_real(name: str) -> bool:
-    """Return whether there may be real drives behind a channel: at a pseudo-terminal or a virtual interface is none."""
+    """Return whether there may be real drives behind a channel, or behind one of several.
+
+    At a pseudo-terminal or a virtual interface there are none.
+    """
+    return any(_may_be_real(one) for one in split_channels(name))
+
+
+def _may_be_real(name: str) -> bool:
     interface, _, where = name.partition(":")
     if interface == "slcan" and os.path.realpath(where).startswith("/dev/pts/"):
         return False
@@ -85,9 +128,10 @@ def may_be_real(name: str) -> bool:
 
 def prepare_channel(name: str) -> None:
     """Load now what `open_channel` would have to load first, so that it will open in milliseconds."""
-    backend = can.interfaces.BACKENDS.get(name.partition(":")[0])
-    if backend is not None:
-        importlib.import_module(backend[0])
+    for one in split_channels(name):
+        backend = can.interfaces.BACKENDS.get(one.partition(":")[0])
+        if backend is not None:
+            importlib.import_module(backend[0])
 
 
 def open_channel(name: str, robot: Robot, clock: Clock) -> Channel:
@@ -98,6 +142,20 @@ def open_channel(name: str, robot: Robot, clock: Clock) -> Channel:
         BusError: if it cannot be opened.
     """
     return _open(name, robot, clock, SLCAN_SETTLE_S)
+
+
+def open_channels(name: str, robot: Robot, clock: Clock) -> list[Channel]:
+    """Open the channels of all buses of a robot; if one cannot be, none stays open. Raises as `open_channel` does."""
+    opened: list[Channel] = []
+    try:
+        for one in split_channels(name):
+            first = open_channel(one, robot, clock)
+            opened += [first, *first.others]
+    except RobotctlError:
+        for channel in opened:
+            channel.close()
+        raise
+    return opened
 
 
 def reopen_channel(name: str, robot: Robot, clock: Clock) -> Channel:
@@ -112,7 +170,7 @@ def _open(name: str, robot: Robot, clock: Clock, settle_s: float) -> Channel:
             f"robot {robot.profile.name!r} has no CAN drives", "use --backend sim, or a robot with drives"
         )
     interface, _, where = name.partition(":")
-    factories = {entry.name: entry for entry in entry_points(group="robotctl.channels")}
+    factories = _factories()
     if interface in factories:
         if where:
             raise ConfigError(f"channel {interface!r} takes no {where!r}", f"use {interface}")
@@ -136,7 +194,8 @@ def open_wired(name: str, wiring: CanBus, options: Mapping[str, Any]) -> Channel
     """
     interface, _, where = name.partition(":")
     bus = open_bus(interface, where, options)
-    return Channel(bus, fd=wiring.fd and bus.protocol is not can.CanProtocol.CAN_20)
+    outbox = KernelQueue(where, bus) if interface == "socketcan" else None
+    return Channel(bus, fd=wiring.fd and bus.protocol is not can.CanProtocol.CAN_20, outbox=outbox)
 
 
 def open_bus(interface: str, where: str, options: Mapping[str, Any]) -> can.BusABC:

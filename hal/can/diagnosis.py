@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from math import pi
 
-from robotctl.hal.can.channel import open_channel
-from robotctl.hal.can.cia402.arm import cycle_load
+from robotctl.hal.can.bandwidth import cycle_s
+from robotctl.hal.can.channel import channel_names, open_channel
 from robotctl.hal.can.cia402.scan import examine_drives
 from robotctl.hal.can.damiao.codec import Status
 from robotctl.hal.can.damiao.faults import status_name
@@ -14,10 +14,9 @@ from robotctl.hal.can.damiao.verification import plausible_turns
 from robotctl.hal.can.found import FoundMotor
 from robotctl.hal.can.interface import interface_findings
 from robotctl.hal.can.scan import LAST_ID, sweep
-from robotctl.hal.can.transport import frame_time_ns
 from robotctl.hal.can.ways import Way, own_way, rate_text
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import BusError
+from robotctl.hal.errors import BusError, ConfigError
 from robotctl.hal.host import Finding, Level
 from robotctl.hal.profile import CLASSIC_HZ, Cia402Drive, DamiaoDrive
 from robotctl.hal.robot import Robot
@@ -61,9 +60,23 @@ def profile_findings(robot: Robot) -> list[Finding]:
 
 
 def channel_findings(robot: Robot, clock: Clock, name: str) -> list[Finding]:
-    """Scan a channel, and compare what answers with the profile. Enables, clears and writes nothing."""
+    """Scan a channel (or one per bus), and compare what answers with the profile. Enables, clears and writes nothing.
+
+    Raises:
+        ConfigError: if there are not as many channels as buses.
+    """
     if robot.profile.can is None:
         return []
+    if robot.profile.buses == 1:
+        return _bus_findings(robot, clock, name)
+    names = channel_names(name, robot)
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{name!r} opens all buses of {robot.profile.name} at once", "name a channel for each bus")
+    return [found for bus, one in enumerate(names) for found in _bus_findings(robot.on_bus(bus), clock, one)]
+
+
+def _bus_findings(robot: Robot, clock: Clock, name: str) -> list[Finding]:
+    assert robot.profile.can is not None
     ids = {drive.id for _, drive, _ in drives_of(robot)}
     nodes = {joint.drive.id for joint in robot.profile.joints if isinstance(joint.drive, Cia402Drive)}
     way = own_way(name, robot.profile.can)
@@ -88,15 +101,13 @@ def load_finding(robot: Robot, way: Way, area: str = "bus") -> Finding:
     """Return how much of the bus the drives of a robot take, and the highest tick rate that it allows."""
     profile = robot.profile
     assert profile.can is not None
-    count = len(drives_of(robot))
-    cycle_s = 2e-9 * count * frame_time_ns(way.fd, way.bitrate, profile.can.data_bitrate)
-    nodes = sum(isinstance(joint.drive, Cia402Drive) for joint in profile.joints)
-    if nodes:
-        count, cycle_s = count + nodes, cycle_s + cycle_load(nodes, 1.0, way.bitrate)
+    wiring = profile.can.model_copy(update={"bitrate": way.bitrate})
+    buses = [[drive for drive in profile.drives if drive.bus == bus] for bus in range(profile.buses)]
+    cycle, count = max((cycle_s(drives, wiring, way.fd), len(drives)) for drives in buses)
     hz = profile.servo_hz if way.fd else min(profile.servo_hz, CLASSIC_HZ)
-    load = cycle_s * hz
+    load = cycle * hz
     level = Level.OK if load <= _COMFORTABLE_LOAD else Level.WARN if load < 1.0 else Level.FAIL
-    highest = int(_COMFORTABLE_LOAD / cycle_s)
+    highest = int(_COMFORTABLE_LOAD / cycle)
     text = f"{count} drives at {hz} Hz on {way} load the bus by {load * 100:.0f} %; it allows up to {highest} Hz"
     return _finding(area, "bus load", level, text, f"servo_hz of at most {highest}, or a second bus")
 

@@ -17,6 +17,9 @@ ERROR_RESTARTED = 0x100
 ERROR_COUNTERS = 0x200
 _CONTROLLER_PASSIVE = 0x30
 _CONTROLLER_ACTIVE = 0x40
+PASSIVE_DATA = bytes([0, _CONTROLLER_PASSIVE, 0, 0, 0, 0, 0, 0])
+RECOVERED_DATA = bytes([0, _CONTROLLER_ACTIVE, 0, 0, 0, 0, 0, 0])
+"""Data of ERROR_CONTROLLER frames: too many errors, and few enough again."""
 _LOCATION_ACK = 0x19
 """data[3] of a protocol error: it happened in the acknowledge slot."""
 

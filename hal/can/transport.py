@@ -8,7 +8,8 @@ the next one. What a thread could do better, the time of arrival, the kernel's r
 A full transmit queue has two causes with opposite answers: a short stall of the adapter, where the frame is dropped
 and the next one goes out, and a bus on which nobody acknowledges, where motion frames would pile up and be replayed
 when power returns. So a full queue is counted, the rest of the cycle is not even tried, and when it lasts for
-`FAILING_LIMIT_NS` the bus is given up.
+`FAILING_LIMIT_NS` the bus is given up. Where the channel tells that frames wait, nothing more is put behind them after
+`WAITING_LIMIT_NS`, however long the queue is.
 """
 
 import errno
@@ -16,13 +17,14 @@ import select
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import can
 
 from robotctl.hal.can.channel import Channel
 from robotctl.hal.can.error_frames import ErrorLog
+from robotctl.hal.can.outbox import prove_empty
 from robotctl.hal.can.tap import Tap
 from robotctl.hal.clock import Clock
 from robotctl.hal.errors import BusError
@@ -32,6 +34,10 @@ SEND_TIMEOUT_S = 0.001
 
 FAILING_LIMIT_NS = 200_000_000
 """A bus on which every send has failed for this long is given up."""
+
+WAITING_LIMIT_NS = 4_000_000
+"""If for this long there was always a frame that waited, no other joins them: so no more than two cycles at 500 Hz, or
+one at 250 Hz, can ever be sent late. On the wire a cycle of eight takes 1 ms, or 2.2 on classic CAN."""
 
 DRAIN_LIMIT = 512
 """Frames taken in one call, so that a babbling node cannot hold the loop."""
@@ -101,6 +107,7 @@ class Transport:
         self.trips: deque[int] = deque(maxlen=4096)
         """Round trips in ns; drives append to it."""
         self._channel = channel
+        self._outbox = channel.outbox
         self._recv = channel.bus.recv
         self._send = channel.bus.send
         self._clock = clock
@@ -108,6 +115,7 @@ class Transport:
         self._lost = ""
         self._closed = False
         self._failing_since: int | None = None
+        self._empty_ns = 0
         self._frame_ns = frame_time_ns(channel.fd, bitrate, data_bitrate)
         self._load = 0.0
         self._load_from = clock.now_ns()
@@ -129,8 +137,7 @@ class Transport:
             raise self._gone()
         if self.inspector is not None and self._is_withheld([(arbitration_id, data)]):
             return False
-        if self.state == "bus-off" and not force:
-            self.send_failures += 1
+        if not force and self._is_closed_off():
             return False
         try:
             self._send(
@@ -154,8 +161,7 @@ class Transport:
             raise self._gone()
         if self.inspector is not None and self._is_withheld(frames):
             return 0
-        if self.state == "bus-off":
-            self.send_failures += 1
+        if self._is_closed_off():
             return 0
         count = 0
         send, fd, message = self._send, self.fd, can.Message
@@ -258,6 +264,33 @@ class Transport:
             "round_trip_us": self.round_trip()._asdict(),
         }
 
+    # --- frames that have not left ----------------------------------------------------------------------------------
+
+    @property
+    def waiting(self) -> bool:
+        """Whether frames that were sent have not left, as far as the channel tells."""
+        return self._outbox is not None and not self._lost and self._outbox.waiting()
+
+    def purge(self) -> None:
+        """Take back what waits, if anything does. Not for the control loop: it may take some tens of milliseconds.
+
+        Raises:
+            BusError: if that was not possible.
+        """
+        if self._outbox is not None and self.waiting:
+            self._outbox.purge()
+            self._failing_since = None
+            self.errors.state = "active"  # its controller has begun anew
+
+    def prove_empty(self, probe: tuple[int, bytes], commands: Collection[int]) -> None:
+        """Take back what waits, and show with a probe (id, data) that nothing does; see `outbox.prove_empty`.
+
+        Where the channel tells nothing, the drives' own answers have to be proof enough.
+        """
+        self.purge()
+        if self._outbox is not None:
+            prove_empty(self._outbox, self.send, probe, commands, self._clock)
+
     def close(self) -> None:
         """Shut the bus down. Harmless when closed, or when the interface is gone."""
         if self._closed:
@@ -276,20 +309,39 @@ class Transport:
 
     # --- trouble ----------------------------------------------------------------------------------------------------
 
+    def _is_closed_off(self) -> bool:
+        """Return whether a frame may not be sent now, since it would leave later; counts it as failed."""
+        if self.state == "bus-off":
+            self.send_failures += 1
+            return True
+        if self._outbox is None:
+            return False
+        now = self._clock.now_ns()
+        if not self._outbox.waiting():
+            self._empty_ns = now
+        if now - self._empty_ns < WAITING_LIMIT_NS:
+            return False
+        self.send_failures += 1
+        self._keep_failing("frames wait, and do not leave")
+        return True
+
     def _send_failed(self, error: Exception) -> None:
         self.send_failures += 1
         codes = _codes(error)
         if codes & _LOST:
             raise self._lose(error) from error
+        self._keep_failing("the transmit queue stays full" if _is_full(error, codes) else str(error), error)
+
+    def _keep_failing(self, what: str, error: Exception | None = None) -> None:
+        """Give the bus up if nothing has left for too long."""
         now = self._clock.now_ns()
         if self._failing_since is None:
             self._failing_since = now
         elif now - self._failing_since > FAILING_LIMIT_NS:
-            what = "the transmit queue stays full" if _is_full(error, codes) else str(error)
             raise BusError(
                 f"no frame could be sent for {FAILING_LIMIT_NS * 1e-9:g} s: {what}",
-                "check motor power, termination and bit rates: nobody acknowledges. Take the interface down and up "
-                "before going on, since old frames wait in the kernel and would be sent when the power returns",
+                "check motor power, termination and bit rates: nobody acknowledges. Before the power returns, see that "
+                "no old frames wait: take the interface down and up, which robotctl does if it may",
             ) from error
 
     def _receive_failed(self, error: Exception) -> None:

@@ -32,20 +32,30 @@ _ERRORS = 256
 
 
 class Bench:
-    """All drives of a robot profile, powered up, in the plant's home pose.
+    """All drives of a robot profile that are on one bus, powered up, in the plant's home pose.
 
     `replies` fills with what the drives answer, `errors` with what went wrong on the wire; whoever runs the bus takes
     it from there.
     """
 
-    def __init__(self, robot: Robot, start_ns: int = 0, fd: bool | None = None, seed: int = 0) -> None:
-        """Build the plant and the drives.
+    def __init__(
+        self,
+        robot: Robot,
+        start_ns: int = 0,
+        fd: bool | None = None,
+        seed: int = 0,
+        bus: int = 0,
+        plant: Plant | None = None,
+    ) -> None:
+        """Build the plant, unless there is one already, and the drives.
 
         Args:
             robot: whose drives.
             start_ns: the present time.
             fd: whether the drives are set to CAN FD; None for what the profile says.
             seed: of measurement noise and trouble.
+            bus: which of the robot's buses.
+            plant: that of its other buses; see `shared_plant`.
 
         Raises:
             ConfigError: if the robot has no CAN drives.
@@ -53,7 +63,7 @@ class Bench:
         profile = robot.profile
         if profile.can is None:
             raise ConfigError(f"robot {profile.name!r} has no CAN drives to emulate", "use panda, openarm or xarm7")
-        self.plant = Plant(robot, start_ns)
+        self.plant = plant or Plant(robot, start_ns)
         self.replies: deque[Reply] = deque()
         self.errors: deque[ErrorFrame] = deque(maxlen=_ERRORS)
         """What the host's controller would tell of the frames that it sent."""
@@ -69,7 +79,7 @@ class Bench:
         self._servos: list[EmulatedDrive] = []
         self._damiao: list[DamiaoDrive] = []
         """Those that register frames may name."""
-        self.drives += _drives(self, robot, profile.can.fd if fd is None else fd, seed)
+        self.drives += _drives(self, robot, bus, profile.can.fd if fd is None else fd, seed)
         self._damiao += [drive for drive in self.drives if isinstance(drive, DamiaoDrive)]
         self.refresh()
         self.at(start_ns + _WARM_NS, self._warm)
@@ -85,6 +95,11 @@ class Bench:
             self._nominal = bitrate
             self.refresh()
 
+    @property
+    def hears(self) -> bool:
+        """Whether any drive has power, and so acknowledges what is sent."""
+        return self._error is not UNACKNOWLEDGED
+
     def drive(self, which: str | int) -> EmulatedDrive:
         """Return a drive by its joint's name or by its present id.
 
@@ -96,6 +111,21 @@ class Bench:
                 return drive
         names = ", ".join(f"{drive.name} ({drive.id})" for drive in self.drives)
         raise ConfigError(f"no motor {which!r}", f"use one of {names}")
+
+    @property
+    def due_ns(self) -> int:
+        """When something falls due next."""
+        return self._next_ns
+
+    @property
+    def is_servoing(self) -> bool:
+        """Whether a drive's own loop has to be stepped with the physics."""
+        return bool(self._servos)
+
+    def step_servos(self) -> None:
+        """Run the drives' own loops for one step of the physics."""
+        for drive in self._servos:
+            drive.step(_STEP_S)
 
     def advance(self, to_ns: int) -> None:
         """Let time pass until `to_ns`; everything that falls due on the way happens at its own time."""
@@ -156,8 +186,7 @@ class Bench:
             return
         plant = self.plant
         while plant.time_ns + PHYSICS_STEP_NS <= to_ns:
-            for drive in self._servos:
-                drive.step(_STEP_S)
+            self.step_servos()
             plant.advance(plant.time_ns + PHYSICS_STEP_NS)
 
     def _happen(self, now: int) -> None:
@@ -269,15 +298,16 @@ class Troubles:
         return [drive for drive in self._bench.drives if trouble.motor_id in (None, drive.id)]
 
 
-def _drives(bench: Bench, robot: Robot, fd: bool, seed: int) -> Iterator[EmulatedDrive]:
-    """Build the drives of a profile, in the order of the plant's axes, as an integrator leaves them."""
+def _drives(bench: Bench, robot: Robot, bus: int, fd: bool, seed: int) -> Iterator[EmulatedDrive]:
+    """Build the drives that a profile has on a bus, in the order of the plant's axes, as an integrator leaves them."""
     profile, plant = robot.profile, bench.plant
     timeout_s = WATCHDOG_SHARE * profile.safety.drive_timeout_s
     delay_ns = round(profile.twin.delay_s * 1e9)
     noise = (profile.twin.noise_position, profile.twin.noise_velocity)
     for axis, joint in enumerate(profile.joints):
         wiring, gains = joint.drive, joint.gains
-        assert wiring is not None
+        if wiring is None or wiring.bus != bus:
+            continue
         scale = wiring.sign * wiring.gear
         shaft = Shaft(plant, axis, scale, wiring.offset, gains.kp, gains.kd)
         own_noise = (noise[0] * wiring.gear, noise[1] * wiring.gear)
@@ -288,7 +318,7 @@ def _drives(bench: Bench, robot: Robot, fd: bool, seed: int) -> Iterator[Emulate
                 bench, joint.name, wiring, shaft, ControlMode.MIT, timeout_s, fd, delay_ns, own_noise, seed + axis
             )
     gripper = profile.gripper
-    if gripper and isinstance(gripper.drive, wired.DamiaoDrive):
+    if gripper and isinstance(gripper.drive, wired.DamiaoDrive) and gripper.drive.bus == bus:
         finger = gripper.fingers[0]
         scale = gripper.motor_open / (finger.open - finger.closed)
         shaft = Shaft(plant, plant.dof, scale, finger.closed, gripper.gains.kp, gripper.gains.kd)

@@ -30,7 +30,7 @@ class Can:
         return open_backend("can", robot, clock, "emulated")
 
     def plant(self, rig: Rig) -> Plant:
-        return rig.arm._channel.bus.bench.plant
+        return rig.arm.channel.bus.bench.plant
 
 
 class TestSimArm(Sim, ArmContract):
@@ -58,9 +58,9 @@ class TestCanGripper(Can, GripperContract):
 
 
 def test_nothing_is_left_out():
-    assert ALL == ["kinova", "openarm", "panda", "xarm7"]
-    assert WITH_DRIVES == ["openarm", "panda", "xarm7"]
-    assert WITH_GRIPPER == ["openarm", "panda"]
+    assert ALL == ["kinova", "openarm", "openarm_bimanual", "panda", "xarm7"]
+    assert WITH_DRIVES == ["openarm", "openarm_bimanual", "panda", "xarm7"]
+    assert WITH_GRIPPER == ["openarm", "openarm_bimanual", "panda"]
 
 
 def test_robots_and_backends_that_do_not_go_together_are_refused():

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from robotctl.control.kinematics import Kinematics
 from robotctl.control.operator import Verb
 from robotctl.control.process_session import ProcessSession
 from robotctl.control.rehearsal import Rehearsal, rehearse
@@ -19,7 +20,7 @@ WALL = "keep_out=[{kind: box, name: wall, centre: [0.63, 0.22, 0.45], half: [0.3
 
 def beside(robot: Robot, turn: float) -> np.ndarray:
     start = np.array(robot.profile.home)
-    start[0] += turn
+    start[int(np.argmax(Kinematics(robot).reach > 0.0))] += turn  # the first that moves the tool
     return start
 
 

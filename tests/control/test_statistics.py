@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robotctl.control.shared import tick_dtype
-from robotctl.control.statistics import TickStatistics, percentiles_us
+from robotctl.control.statistics import Tail, TickStatistics, percentiles_us
 from robotctl.safety.shaper import Clip
 
 PERIOD = 2_000_000
@@ -84,3 +84,14 @@ def test_nothing_taken():
         "tick_us": None,
         "lateness_us": None,
     }
+
+
+def test_a_run_without_end_keeps_the_latest_values_and_no_more(monkeypatch):
+    monkeypatch.setattr("robotctl.control.statistics.REMEMBERED", 1000)
+    tail, lengths = Tail(), set()
+    for value in range(0, 100_000, 25):
+        tail.take(np.arange(value, value + 25))
+        lengths.add(len(tail._values))
+    assert max(lengths) <= 2 * (1000 + 25)
+    assert 1000 <= len(tail.values) <= 2050
+    assert (tail.values == np.arange(100_000 - len(tail.values), 100_000)).all()

@@ -240,6 +240,22 @@ def test_a_drive_without_power_does_not_keep_the_others_on(openarm: Scene) -> No
     assert not any(openarm.enabled)
 
 
+def test_what_waits_without_power_is_taken_back_and_where_that_fails_it_is_told(
+    openarm: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse() -> None:
+        raise BusError("old frames may wait in the kernel", "leave the power off")
+
+    for drive in openarm.bench.drives:
+        drive.power_down()
+    monkeypatch.setattr(openarm.channel.bus, "purge", refuse)
+    openarm.rescue()
+    logs = [event["text"] for event in openarm.session.link.events.since(0)[0] if event["type"] == "log"]
+    assert "old frames may wait in the kernel" in logs[-1]
+    assert "leave the power off" in logs[-1]
+    assert openarm.session.state is State.FAULT
+
+
 def test_a_channel_that_cannot_be_opened_is_told(openarm: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise BusError("the adapter is gone")

@@ -16,8 +16,8 @@ def edited(tmp_path: Path, old: str, new: str, name: str = "panda") -> Path:
     return path
 
 
-def test_four_robots_are_shipped() -> None:
-    assert robot_names() == ["kinova", "openarm", "panda", "xarm7"]
+def test_five_robots_are_shipped() -> None:
+    assert robot_names() == ["kinova", "openarm", "openarm_bimanual", "panda", "xarm7"]
 
 
 def test_home_and_rest_lie_inside_the_sphere(robot: Robot) -> None:
@@ -103,7 +103,7 @@ def test_the_line_of_a_bad_key_is_named(tmp_path: Path) -> None:
 
 
 def test_an_unknown_robot_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match="kinova, openarm, panda, xarm7"):
+    with pytest.raises(ConfigError, match="kinova, openarm, openarm_bimanual, panda, xarm7"):
         load_robot("pander")
     with pytest.raises(ConfigError, match="No such file"):
         load_robot("nowhere/robot.yaml")

@@ -6,6 +6,7 @@ from robotctl.trials.scenario import Scenario
 from robotctl.trials.scenarios import (
     bereft,
     bus,
+    cable,
     configuration,
     contact,
     guarded,
@@ -26,6 +27,7 @@ _MODULES = (
     policy,
     machine,
     bus,
+    cable,
     operator,
     contact,
     proximity,

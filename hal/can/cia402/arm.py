@@ -26,14 +26,10 @@ from robotctl.hal.can.damiao.passenger import Passenger
 from robotctl.hal.can.problems import raise_problems
 from robotctl.hal.can.transport import Transport
 from robotctl.hal.clock import Clock
-from robotctl.hal.errors import ConfigError, DriveError, HardwareError
+from robotctl.hal.errors import DriveError, HardwareError
 from robotctl.hal.profile import Cia402Drive, DamiaoDrive
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, CommandMode, Fault, Sample, Sent
-
-FRAME_BITS = (125, 115, 135, 105)
-"""Of RPDO1, RPDO2, TPDO1 and TPDO2 (7, 6, 8 and 5 bytes) at the worst of bit stuffing."""
-_SYNC_BITS = 55
 
 _SYNC = (SYNC_ID, b"")
 _MODES = {CommandMode.TRACK: Mode.POSITION, CommandMode.DAMP: Mode.VELOCITY, CommandMode.EFFORT: Mode.TORQUE}
@@ -49,19 +45,12 @@ class Cia402Arm(CanArm):
         """Prepare. Opens and sends nothing.
 
         Raises:
-            ConfigError: if the profile has no CAN drives, or asks for what the wire cannot carry.
+            ConfigError: if the profile has no CAN drives.
         """
         super().__init__(robot, clock, channel)
         profile = robot.profile
         self.identities: dict[str, Identity] = {}
         self._specs = [(joint.name, joint.drive) for joint in profile.joints if isinstance(joint.drive, Cia402Drive)]
-        load = cycle_load(len(self._specs), profile.servo_hz, self._can.bitrate)
-        if load > 1.0:
-            raise ConfigError(
-                f"{robot.source}: {len(self._specs)} drives at {profile.servo_hz} Hz would load the bus by "
-                f"{100.0 * load:.0f} %",
-                f"servo_hz of at most {int(profile.servo_hz / load)}",
-            )
         self._expected = [Expected.of(robot, joint) for joint in profile.joints]
         gripper = profile.gripper
         self._passenger = (
@@ -282,8 +271,3 @@ class Cia402Arm(CanArm):
         if off:
             reasons.append(f"drives are off: {', '.join(off)}")
         return Sent(command, "; ".join(reasons))
-
-
-def cycle_load(drives: int, hertz: float, bitrate: int) -> float:
-    """Return the part of a bus that the PDOs of so many drives and SYNC take, at the worst of bit stuffing."""
-    return (drives * sum(FRAME_BITS) + _SYNC_BITS) * hertz / bitrate

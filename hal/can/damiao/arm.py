@@ -99,12 +99,13 @@ class DamiaoArm(CanArm):
         Raises:
             DriveError: if one drive is not as it should be.
             DrivesError: if several are, or one in several ways; it holds them all.
-            BusError: if the bus is gone.
+            BusError: if the bus is gone, nobody is on it, or old frames were sent.
         """
         transport = self._require_open()
         self._verified = False
         self.warnings.clear()
         self.identities.clear()
+        transport.prove_empty(self._drives[0].question, {drive.id for drive in self._drives})
         others = Eavesdropper()
         transport.listener = others
         problems: list[DriveError] = []
@@ -169,8 +170,8 @@ class DamiaoArm(CanArm):
         transport = self._require_open()
         transport.drain()
         now = self._clock.now_ns()
-        if self._verified and not self._enabled and now - self._polled_ns >= _POLL_PERIOD_NS:
-            self._poll(transport, now)
+        if self._verified and not self._enabled and now - self._polled_ns >= _POLL_PERIOD_NS and not transport.waiting:
+            self._poll(transport, now)  # one round may wait for an arm without power, not one after the other
         joints = self._joints
         enabled = True
         faults: tuple[Fault, ...] = ()
@@ -188,27 +189,41 @@ class DamiaoArm(CanArm):
 
         While the drives are off nothing is sent, but the effort is remembered: `enable` holds with it.
         """
-        transport = self._require_open()
+        self._require_open()
         self._feed_forward = command.effort
         if not self._enabled:
             return Sent(command, "drives are off")
-        joints = self._joints
-        mode, position, velocity, effort = command
         try:
-            if mode == CommandMode.TRACK:
-                targets, speeds = position.tolist(), velocity.tolist()
-            else:
-                # kp is 0, so the angle has no effect; the measured one is what a reader of the log expects.
-                targets, speeds = [drive.position for drive in joints], self._still
-            frames = [
-                (drive.id, drive.encode(q, dq, torque, gains))
-                for drive, q, dq, torque, gains in zip(
-                    joints, targets, speeds, effort.tolist(), self._gains[mode], strict=True
-                )
-            ]
+            frames = self.encode(command)
         except (ValueError, OverflowError):
             text = "not sent: a value is not finite, or there are not as many as joints"
             return Sent(command, text, delivered=False)
+        return self.send(command, frames)
+
+    def encode(self, command: Command) -> list[tuple[int, bytes]]:
+        """Return the frames (id, data) of a command, one per joint.
+
+        Raises:
+            ValueError, OverflowError: if a value is not finite, or there are not as many as joints.
+        """
+        joints = self._joints
+        mode, position, velocity, effort = command
+        if mode == CommandMode.TRACK:
+            targets, speeds = position.tolist(), velocity.tolist()
+        else:
+            # kp is 0, so the angle has no effect; the measured one is what a reader of the log expects.
+            targets, speeds = [drive.position for drive in joints], self._still
+        return [
+            (drive.id, drive.encode(q, dq, torque, gains))
+            for drive, q, dq, torque, gains in zip(
+                joints, targets, speeds, effort.tolist(), self._gains[mode], strict=True
+            )
+        ]
+
+    def send(self, command: Command, frames: Sequence[tuple[int, bytes]]) -> Sent:
+        """Send what `encode` made of a command to drives that are on; the rest of `write`."""
+        transport, joints = self._require_open(), self._joints
+        self._feed_forward = command.effort
         now = self._clock.now_ns()
         count = transport.send_all(frames)
         if transport.refusal:
@@ -222,7 +237,7 @@ class DamiaoArm(CanArm):
             # The replies are there already: stamp them now, not one tick later.
             transport.drain()
         if count < len(frames):
-            text = f"{len(frames) - count} frames were not sent: the transmit queue is full"
+            text = f"{len(frames) - count} frames were not sent: nothing leaves, or the transmit queue is full"
             return Sent(command, text, delivered=False)
         for drive in joints:
             if drive.saturated or drive.status != 1:

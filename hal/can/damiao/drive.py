@@ -65,10 +65,9 @@ class Drive:
     """
 
     __slots__ = (
-        "_clock", "_from_effort", "_from_position", "_from_velocity", "_high", "_low", "_replies", "_reply_key",
-        "_to_effort", "_to_position", "_to_velocity", "_transport", "_trips", "effort", "fold", "heard", "id",
-        "missed", "mosfet_temperature", "name", "position", "ranges", "reply_id", "reply_pending", "rotor_temperature",
-        "saturated", "scale", "sent_ns", "stamp_ns", "status", "velocity", "zero",
+        "_clock", "_from_wire", "_high", "_low", "_replies", "_reply_key", "_to_wire", "_transport", "_trips", "effort",
+        "fold", "heard", "id", "missed", "mosfet_temperature", "name", "position", "ranges", "reply_id",
+        "reply_pending", "rotor_temperature", "saturated", "scale", "sent_ns", "stamp_ns", "status", "velocity", "zero",
     )  # fmt: skip
 
     def __init__(
@@ -125,13 +124,17 @@ class Drive:
         self.ranges = ranges
         self.fold = fold
         centre = self.zero + fold
-        # step = value * slope + intercept, with the half that turns int() into rounding
-        self._to_position = (scale * _U16 / (2.0 * pmax), (pmax - scale * centre) * _U16 / (2.0 * pmax) + 0.5)
-        self._to_velocity = (scale * _U12 / (2.0 * vmax), _U12 / 2.0 + 0.5)
-        self._to_effort = (_U12 / (2.0 * tmax * scale), _U12 / 2.0 + 0.5)
-        self._from_position = (2.0 * pmax / _U16 / scale, centre - pmax / scale)
-        self._from_velocity = (2.0 * vmax / _U12 / scale, -vmax / scale)
-        self._from_effort = (2.0 * tmax / _U12 * scale, -tmax * scale)
+        # Of position, velocity, effort: step = value * slope + intercept, with the half that turns int() into rounding
+        self._to_wire = (
+            *(scale * _U16 / (2.0 * pmax), (pmax - scale * centre) * _U16 / (2.0 * pmax) + 0.5),
+            *(scale * _U12 / (2.0 * vmax), _U12 / 2.0 + 0.5),
+            *(_U12 / (2.0 * tmax * scale), _U12 / 2.0 + 0.5),
+        )
+        self._from_wire = (
+            *(2.0 * pmax / _U16 / scale, centre - pmax / scale),
+            *(2.0 * vmax / _U12 / scale, -vmax / scale),
+            *(2.0 * tmax / _U12 * scale, -tmax * scale),
+        )
 
     def fold_near(self, angle: float, turn: float) -> None:
         """Fold by whole turns (rad of the joint), so that the measured angle is the one closest to `angle`."""
@@ -151,12 +154,10 @@ class Drive:
 
         The same as `codec.encode_mit`, with the factors worked out beforehand: 0.9 us instead of 2.4.
         """
-        slope, intercept = self._to_position
-        p = int(position * slope + intercept)
-        slope, intercept = self._to_velocity
-        v = int(velocity * slope + intercept)
-        slope, intercept = self._to_effort
-        t = int(effort * slope + intercept)
+        p_slope, p_zero, v_slope, v_zero, t_slope, t_zero = self._to_wire
+        p = int(position * p_slope + p_zero)
+        v = int(velocity * v_slope + v_zero)
+        t = int(effort * t_slope + t_zero)
         if not (0 <= p <= _U16 and 0 <= v <= _U12 and 0 <= t <= _U12):
             self.saturated = True
             p = min(max(p, 0), _U16)
@@ -187,12 +188,10 @@ class Drive:
             self._replies.append(bytes(data[4:]))
             return True
         word = int.from_bytes(data, "big")
-        slope, intercept = self._from_position
-        self.position = (word >> 40 & _U16) * slope + intercept
-        slope, intercept = self._from_velocity
-        self.velocity = (word >> 28 & _U12) * slope + intercept
-        slope, intercept = self._from_effort
-        self.effort = (word >> 16 & _U12) * slope + intercept
+        p_slope, p_zero, v_slope, v_zero, t_slope, t_zero = self._from_wire
+        self.position = (word >> 40 & _U16) * p_slope + p_zero
+        self.velocity = (word >> 28 & _U12) * v_slope + v_zero
+        self.effort = (word >> 16 & _U12) * t_slope + t_zero
         self.status = word >> 60
         self.mosfet_temperature = word >> 8 & 0xFF
         self.rotor_temperature = word & 0xFF
@@ -286,9 +285,14 @@ class Drive:
                 return
         raise self.silent()
 
+    @property
+    def question(self) -> tuple[int, bytes]:
+        """The frame (id, data) that asks for feedback and changes nothing."""
+        return BROADCAST_ID, encode_register(self.id, RegisterCommand.REFRESH)
+
     def poll(self) -> bool:
         """Ask for feedback without waiting; return whether the request left the host."""
-        return self._transport.send(BROADCAST_ID, encode_register(self.id, RegisterCommand.REFRESH))
+        return self._transport.send(*self.question)
 
     def special(self, command: Special) -> bool:
         """Send enable, disable or clear-error, and return whether it left the host."""

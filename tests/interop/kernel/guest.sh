@@ -8,9 +8,10 @@ mount -t tmpfs tmpfs /dev/shm 2>/dev/null || { mkdir -p /dev/shm && mount -t tmp
 mount -t tmpfs tmpfs /run
 dir=$(sed 's/.*robotctl\.dir=\([^ ]*\).*/\1/' /proc/cmdline)
 modules=/usr/lib/uml/modules/$(uname -r)/kernel
-for module in net/can/can.ko net/can/can-raw.ko drivers/net/can/dev/can-dev.ko drivers/net/can/vcan.ko; do
+for module in net/can/can.ko net/can/can-raw.ko drivers/net/can/dev/can-dev.ko net/sched/sch_plug.ko; do
     insmod "$modules/$module"
 done
+insmod "$modules/drivers/net/can/vcan.ko" echo=1 # tells what has left once it has, as hardware does
 ip link set lo up
 ip link add dev vcan0 type vcan
 ip link set vcan0 mtu 72 up

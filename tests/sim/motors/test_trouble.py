@@ -15,7 +15,7 @@ from robotctl.hal.can.damiao.codec import (
     encode_special,
 )
 from robotctl.hal.can.damiao.registers import Register
-from robotctl.hal.can.error_frames import GARBLED, UNACKNOWLEDGED
+from robotctl.hal.can.error_frames import ERROR_CONTROLLER, GARBLED, UNACKNOWLEDGED
 from robotctl.hal.clock import VirtualClock
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
@@ -189,7 +189,7 @@ def test_a_bus_without_power_acknowledges_nothing(desk: Desk) -> None:
     assert desk.errors == []
     desk.bench.trouble.add(PowerCut())
     assert desk.ask() == []
-    assert desk.errors == [UNACKNOWLEDGED.error_class]
+    assert desk.errors == [ERROR_CONTROLLER, UNACKNOWLEDGED.error_class]
 
 
 def test_a_drive_at_another_bit_rate_breaks_frames_on_the_wire(desk: Desk) -> None:

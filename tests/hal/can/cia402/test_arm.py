@@ -263,8 +263,15 @@ def test_lost_frames_are_counted_and_survived(desk):
 
 
 def test_a_bus_that_is_too_slow_is_refused():
-    with pytest.raises(ConfigError, match=r"load the bus by 137 %\n  try: servo_hz of at most 146"):
-        open_backend("can", load_robot("xarm7", ["can.bitrate=500000"]), VirtualClock())
+    arm = open_backend("can", load_robot("xarm7", ["can.bitrate=500000"]), VirtualClock()).arm
+    with pytest.raises(ConfigError, match=r"a load of 137%\n  try: --set servo_hz=131$"):
+        arm.connect()
+    assert arm.channel is None
+
+
+def test_only_damiao_drives_may_be_on_several_buses():
+    with pytest.raises(ConfigError, match=r"(?s)CiA 402 drives on a robot with 2 buses.*one bus"):
+        open_backend("can", load_robot("xarm7", ["joints.0.drive.bus=1"]), VirtualClock())
 
 
 def test_joints_of_one_arm_speak_one_protocol():

@@ -1,0 +1,33 @@
+"""Two arms, each with a bus of its own: what befalls the one does not touch the other."""
+
+import errno
+
+import can
+import numpy as np
+import pytest
+
+from robotctl.hal.errors import BusError
+from robotctl.hal.robot import Robot
+from robotctl.safety.machine import State
+from robotctl.safety.trip import Category
+from robotctl.trials.bench import Bench
+from robotctl.trials.stops import running
+
+
+def test_one_bus_is_lost_and_the_other_arm_goes_on(panda: Robot) -> None:
+    with Bench(panda, "can", seed=0) as lost, Bench(panda, "can", seed=1) as alive:
+        for bench in (lost, alive):
+            running(bench)
+        lost.bus.failure = can.CanOperationError("a test", errno.ENODEV)
+        with pytest.raises(BusError, match="check the adapter"):
+            lost.tick()
+        lost.take_events()
+        assert [(trip["protection"], trip["stop_category"]) for trip in lost.trips] == [("P14", Category.CUT)]
+        begun = alive.now_ns
+        for _ in range(500):
+            lost.let_pass(panda.period_ns)
+            alive.tick()
+        assert not any(drive.shaft.state()[2] for drive in lost.motors.drives[: panda.dof])
+        assert alive.state is State.RUN
+        assert alive.trips == []
+        assert (np.abs(alive.since(begun)["true_velocity"]).max(axis=1) > 0.05).mean() > 0.9
