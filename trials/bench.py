@@ -23,6 +23,7 @@ from robotctl.safety.target import Target
 from robotctl.sim.backend import SimArm
 from robotctl.sim.motors.bench import Bench as Motors
 from robotctl.sim.motors.bus import EmulatedBus
+from robotctl.sim.motors.drive import EmulatedDrive
 from robotctl.sim.plant import Plant
 from robotctl.sim.trouble import TroubledArm
 
@@ -37,10 +38,13 @@ Policy = Callable[["Bench", float], Target | None]
 """What the bench's policy wants at a time, s since it began; None for silence."""
 
 
-def emulated_bus(arm: Arm) -> EmulatedBus | None:
-    """Return the emulated bus that an arm is on, if it is on one; of several, the first."""
-    channel = arm.channel if isinstance(arm, CanArm | JoinedArm) else None
-    return channel.bus if channel is not None and isinstance(channel.bus, EmulatedBus) else None
+def emulated_buses(arm: Arm) -> list[EmulatedBus]:
+    """Return the emulated buses that an arm is on."""
+    if isinstance(arm, JoinedArm):
+        channels = arm.channels
+    else:
+        channels = [arm.channel] if isinstance(arm, CanArm) and arm.channel is not None else []
+    return [channel.bus for channel in channels if isinstance(channel.bus, EmulatedBus)]
 
 
 def plant_behind(arm: Arm) -> Plant:
@@ -51,10 +55,10 @@ def plant_behind(arm: Arm) -> Plant:
     """
     if isinstance(arm, SimArm):
         return arm.plant
-    bus = emulated_bus(arm)
-    if bus is None:
+    buses = emulated_buses(arm)
+    if not buses:
         raise HardwareError("there is no plant behind this arm")
-    return bus.bench.plant
+    return buses[0].bench.plant  # that of them all
 
 
 class Bench:
@@ -100,16 +104,38 @@ class Bench:
         return arm if isinstance(arm, SimArm) else None
 
     @property
-    def bus(self) -> EmulatedBus | None:
-        """The bus, if the arm is on emulated motors."""
-        return emulated_bus(self._rig.arm)
+    def buses(self) -> list[EmulatedBus]:
+        """The buses, if the arm is on emulated motors; there are none on the twin."""
+        return emulated_buses(self._rig.arm)
 
     @property
-    def motors(self) -> Motors:
-        """The emulated motors; there are some unless the arm is the twin."""
-        if self.bus is None:
+    def drives(self) -> list[EmulatedDrive]:
+        """The emulated drives of all buses, the grippers', too."""
+        return [drive for bus in self.buses for drive in bus.bench.drives]
+
+    def motors_of(self, axis: int) -> Motors:
+        """Return the emulated motors of the bus that a joint's drive is on.
+
+        Raises:
+            HardwareError: if there are none.
+        """
+        drive = self.robot.profile.joints[axis].drive
+        if not self.buses or drive is None:
             raise HardwareError(f"there are no emulated motors behind {self.backend}")
-        return self.bus.bench
+        return self.buses[drive.bus].bench
+
+    def drive(self, axis: int) -> EmulatedDrive:
+        """Return the emulated drive of a joint."""
+        return self.motors_of(axis).drive(self.robot.profile.joints[axis].name)
+
+    def statistics(self) -> list[dict[str, Any]]:
+        """Return the counters of every bus; there are none on the twin."""
+        statistics: dict[str, Any] = self.arm.bus_statistics() or {}
+        return statistics.get("buses") or ([statistics] if statistics else [])
+
+    def count(self, counter: str) -> int:
+        """Return what a counter has come to on all buses."""
+        return sum(int(each[counter]) for each in self.statistics())
 
     @property
     def plant(self) -> Plant:
@@ -158,7 +184,7 @@ class Bench:
         if self.twin:
             self.twin.read()
         else:
-            self.motors.advance(self.now_ns)
+            self.buses[0].advance(self.now_ns)  # and all others with it
 
     def run(self, seconds: float) -> State:
         """Tick for some time."""

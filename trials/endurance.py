@@ -19,7 +19,7 @@ from robotctl.hal.robot import Robot
 from robotctl.safety.machine import State
 from robotctl.sim.motors.drive import Reply
 from robotctl.sim.motors.trouble import Trouble
-from robotctl.trials.bench import emulated_bus
+from robotctl.trials.bench import emulated_buses
 from robotctl.trials.policies import random
 from robotctl.trials.soak import POLICY_S, put_action
 
@@ -87,14 +87,14 @@ def endure(
     rng = np.random.default_rng(seed)
     act = random(robot, rng)
     with LockstepSession(robot, "can") as session:
-        bus = emulated_bus(session._rig.arm)
-        assert bus is not None
-        bus.bench.plant.place(np.array(robot.profile.home))
+        buses = emulated_buses(session._rig.arm)
+        buses[0].bench.plant.place(np.array(robot.profile.home))
         session.advance(_SETTLE_S)
         session.prepare()
         session.begin()
         trouble = BadBus(share=share, dice=Random(seed))
-        bus.bench.trouble.add(trouble)
+        for bus in buses:
+            bus.bench.trouble.add(trouble)
         begun, done, seq = session.statistics.ticks, 0, 0
         while done < ticks and session.state is State.RUN:
             seq += 1
@@ -105,7 +105,8 @@ def endure(
                 looks.append(_look(done))
                 if on_look is not None:
                     on_look(looks[-1])
-        bus.bench.trouble.remove(trouble)
+        for bus in buses:
+            bus.bench.trouble.remove(trouble)
         session.bring_to_rest(Verb.DISARM)
         statistics = session.bus_statistics() or {}
         stops = [f"{trip['protection']}: {trip['text']}" for trip in session.trips]

@@ -16,7 +16,6 @@ from robotctl.hal.robot import Robot
 from robotctl.hal.types import Sample, Vector
 from robotctl.sim import trouble as twin
 from robotctl.sim.motors import trouble as wire
-from robotctl.sim.motors.drive import EmulatedDrive
 from robotctl.trials.bench import Bench
 
 
@@ -50,13 +49,13 @@ def between(bench: Bench, trouble: twin.Trouble) -> Planted:
 
 def on_wire(bench: Bench, trouble: wire.Trouble, axes: Iterable[int], showed: Callable[[], bool]) -> Planted:
     """Put some motors into trouble."""
-    troubles = [replace(trouble, motor_id=_drive(bench, axis).id) for axis in axes]
-    for each in troubles:
-        bench.motors.trouble.add(each)
+    troubles = [(bench.motors_of(axis).trouble, replace(trouble, motor_id=bench.drive(axis).id)) for axis in axes]
+    for place, each in troubles:
+        place.add(each)
 
     def undo() -> None:
-        for each in troubles:
-            bench.motors.trouble.remove(each)
+        for place, each in troubles:
+            place.remove(each)
 
     return Planted(undo, showed)
 
@@ -177,9 +176,9 @@ def failed(bench: Bench, axis: int) -> Planted:
         arm = bench.twin
         arm.fail([axis], fault.code, fault.name, fault.hint)
         return Planted(lambda: None, lambda: bool(arm.read().faults))
-    drive = _drive(bench, axis)
+    drive = bench.drive(axis)
     before = drive.status
-    bench.motors.trouble.add(wire.Failure(motor_id=drive.id))
+    bench.motors_of(axis).trouble.add(wire.Failure(motor_id=drive.id))
     return Planted(lambda: None, lambda: drive.status != before)
 
 
@@ -196,14 +195,14 @@ def unpowered(bench: Bench, axes: Iterable[int]) -> Planted:
             arm.power_up(axes)
 
         return Planted(undo, lambda: not arm.read().enabled)
-    return on_wire(bench, wire.PowerCut(), axes, lambda: not any(_drive(bench, axis).powered for axis in axes))
+    return on_wire(bench, wire.PowerCut(), axes, lambda: not any(bench.drive(axis).powered for axis in axes))
 
 
 def hot(bench: Bench, axis: int, celsius: float) -> Planted:
     """A drive is too hot. Undone by letting it cool."""
     if bench.twin:
         return between(bench, twin.Heat([axis], celsius))
-    thermal = _drive(bench, axis).thermal
+    thermal = bench.drive(axis).thermal
     before = thermal.rotor
     thermal.rotor = celsius
     thermal.step(0.0, 0.0)
@@ -222,7 +221,7 @@ def runaway(bench: Bench, axis: int, torque: float) -> Planted:
     wiring = bench.robot.profile.joints[axis].drive
     assert wiring is not None
     own = torque / (wiring.sign * wiring.gear)
-    return on_wire(bench, wire.Runaway(torque=own), [axis], lambda: _drive(bench, axis).shaft.is_running_away)
+    return on_wire(bench, wire.Runaway(torque=own), [axis], lambda: bench.drive(axis).shaft.is_running_away)
 
 
 def weak(bench: Bench, axis: int, part: float) -> Planted:
@@ -244,7 +243,7 @@ def misread(bench: Bench, axis: int, offset: float) -> Planted:
         shift = np.zeros(bench.robot.dof)
         shift[axis] = offset
         return between(bench, twin.Misread(shift))
-    wiring, drive, begun = bench.robot.profile.joints[axis].drive, _drive(bench, axis), bench.now_ns
+    wiring, drive, begun = bench.robot.profile.joints[axis].drive, bench.drive(axis), bench.now_ns
     assert wiring is not None
 
     def showed() -> bool:
@@ -259,13 +258,28 @@ def frozen(bench: Bench, axis: int) -> Planted:
     """A joint is measured at rest where it is now, however it moves."""
     if bench.twin:
         return between(bench, twin.Frozen([axis], _seen(bench)))
-    drive, begun = _drive(bench, axis), bench.now_ns
+    drive, begun = bench.drive(axis), bench.now_ns
 
     def showed() -> bool:
         records = bench.since(begun)
         return bool(np.abs(records["velocity"] - records["true_velocity"])[:, axis].max() > 0.1)
 
     return on_wire(bench, wire.Frozen(angle=drive.angle, tell=drive.frozen), [axis], showed)
+
+
+# -- on all buses ------------------------------------------------------------------------------------------------------
+
+
+def report(bench: Bench, error_class: int, data: bytes = bytes(8)) -> None:
+    """Let every controller tell of an error, in SocketCAN's terms."""
+    for bus in bench.buses:
+        bus.report(error_class, data)
+
+
+def refuse(bench: Bench, failure: Exception | None) -> None:
+    """Let every bus refuse whatever is sent, or take it again."""
+    for bus in bench.buses:
+        bus.failure = failure
 
 
 def on_canopen(robot: Robot) -> bool:
@@ -275,7 +289,7 @@ def on_canopen(robot: Robot) -> bool:
 
 def faulty(bench: Bench) -> bool:
     """Return whether an emulated drive has a fault."""
-    return bench.twin is None and any(drive.is_faulty for drive in bench.motors.drives)
+    return bench.twin is None and any(drive.is_faulty for drive in bench.drives)
 
 
 def cycle_power(bench: Bench) -> None:
@@ -293,10 +307,10 @@ def _cycle_twin(bench: Bench) -> None:
 
 
 def _cycle_motors(bench: Bench) -> None:
-    for drive in bench.motors.drives:
+    for drive in bench.drives:
         drive.power_down()
     bench.run(0.2)
-    for drive in bench.motors.drives:
+    for drive in bench.drives:
         drive.power_up()
     bench.run(0.05)
 
@@ -304,10 +318,6 @@ def _cycle_motors(bench: Bench) -> None:
 def _seen(bench: Bench) -> Sample:
     assert bench.arm.seen is not None
     return bench.arm.seen
-
-
-def _drive(bench: Bench, axis: int) -> EmulatedDrive:
-    return bench.motors.drive(bench.robot.profile.joints[axis].name)
 
 
 def _missed(bench: Bench, axes: Iterable[int]) -> int:

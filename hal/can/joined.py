@@ -78,6 +78,11 @@ class JoinedArm(Arm):
         """The open channel of the first bus; None before `connect` and after `close`."""
         return self.arms[0].channel
 
+    @property
+    def channels(self) -> list[Channel]:
+        """The open channels, by bus; none before `connect` and after `close`."""
+        return [arm.channel for arm in self.arms if arm.channel is not None]
+
     # --- life -------------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:

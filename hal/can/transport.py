@@ -282,14 +282,17 @@ class Transport:
             self._failing_since = None
             self.errors.state = "active"  # its controller has begun anew
 
-    def prove_empty(self, probe: tuple[int, bytes], commands: Collection[int]) -> None:
+    def prove_empty(self, probe: tuple[int, bytes], commands: Collection[int]) -> bool:
         """Take back what waits, and show with a probe (id, data) that nothing does; see `outbox.prove_empty`.
 
-        Where the channel tells nothing, the drives' own answers have to be proof enough.
+        Returns whether the probe was sent: where the channel tells nothing, the drives' own answers have to be proof
+        enough.
         """
         self.purge()
-        if self._outbox is not None:
-            prove_empty(self._outbox, self.send, probe, commands, self._clock)
+        if self._outbox is None:
+            return False
+        prove_empty(self._outbox, self.send, probe, commands, self._clock)
+        return True
 
     def close(self) -> None:
         """Shut the bus down. Harmless when closed, or when the interface is gone."""

@@ -65,7 +65,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         self._fd = fd
         self._clock = clock
         self._now = clock.now_ns
-        self._advance = advance or bench.advance
+        self.advance = advance or bench.advance
         self._receive = bench.receive
         self._replies = bench.replies
         self._wire_errors = bench.errors
@@ -76,7 +76,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
         Raises:
             can.CanOperationError: for a CAN FD frame on a classic bus.
         """
-        self._advance(self._now())
+        self.advance(self._now())
         if self.failure is not None:
             raise self.failure
         if msg.is_fd and not self._fd:
@@ -93,7 +93,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
     # --- the outbox -------------------------------------------------------------------------------------------------
 
     def waiting(self) -> bool:
-        self._advance(self._now())
+        self.advance(self._now())
         return self._is_blocked() and bool(self._waiting)
 
     def purge(self) -> None:
@@ -135,7 +135,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the next reply, or None when none comes within `timeout` seconds of the clock; None waits for ever."""
-        self._advance(self._now())
+        self.advance(self._now())
         if self._waiting:
             self._is_blocked()
         message = self._pop()
@@ -147,7 +147,7 @@ class EmulatedBus(can.BusABC):  # type: ignore[misc]
             if deadline is not None and now >= deadline:
                 return None
             self._clock.sleep_until(now + _POLL_NS if deadline is None else min(now + _POLL_NS, deadline))
-            self._advance(self._now())
+            self.advance(self._now())
             message = self._pop()
         return message
 

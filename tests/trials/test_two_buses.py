@@ -18,7 +18,7 @@ def test_one_bus_is_lost_and_the_other_arm_goes_on(panda: Robot) -> None:
     with Bench(panda, "can", seed=0) as lost, Bench(panda, "can", seed=1) as alive:
         for bench in (lost, alive):
             running(bench)
-        lost.bus.failure = can.CanOperationError("a test", errno.ENODEV)
+        lost.buses[0].failure = can.CanOperationError("a test", errno.ENODEV)
         with pytest.raises(BusError, match="check the adapter"):
             lost.tick()
         lost.take_events()
@@ -27,7 +27,7 @@ def test_one_bus_is_lost_and_the_other_arm_goes_on(panda: Robot) -> None:
         for _ in range(500):
             lost.let_pass(panda.period_ns)
             alive.tick()
-        assert not any(drive.shaft.state()[2] for drive in lost.motors.drives[: panda.dof])
+        assert not any(drive.shaft.state()[2] for drive in lost.drives[: panda.dof])
         assert alive.state is State.RUN
         assert alive.trips == []
         assert (np.abs(alive.since(begun)["true_velocity"]).max(axis=1) > 0.05).mean() > 0.9

@@ -3,7 +3,6 @@
 import errno
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import can
 import numpy as np
@@ -15,7 +14,7 @@ from robotctl.sim.motors import trouble as wire
 from robotctl.sim.trouble import Misread, NoWatchdog, Reject, Report, Trouble
 from robotctl.trials.bench import Bench
 from robotctl.trials.clearing import Clears
-from robotctl.trials.faults import Planted, between, misread, on_canopen, on_wire
+from robotctl.trials.faults import Planted, between, misread, on_canopen, on_wire, refuse, report
 from robotctl.trials.orphans import orphan_scenario, without_bus
 from robotctl.trials.refusals import refusal_scenario
 from robotctl.trials.scenario import Scenario
@@ -40,7 +39,7 @@ def _timeout_of(seconds: float) -> Callable[[Robot, str, int], None]:
             bench.arm.troubles.append(NoWatchdog(name))
         else:
             bench.arm.connect()
-            bench.motors.drive(name).set_watchdog(seconds)
+            bench.drive(axis).set_watchdog(seconds)
         with bench:
             pass
 
@@ -48,11 +47,12 @@ def _timeout_of(seconds: float) -> Callable[[Robot, str, int], None]:
 
 
 def _bus_off(bench: Bench) -> Planted:
-    if bench.bus is None:
+    if bench.twin:
         return between(bench, Report(Fault("bus", _ERROR_BUS_OFF, "BUS_OFF", "check cable and termination")))
-    bus = bench.bus
-    bus.report(_ERROR_BUS_OFF)
-    return Planted(lambda: bus.report(_ERROR_RESTARTED), lambda: _statistics(bench)["state"] == "bus-off")
+    report(bench, _ERROR_BUS_OFF)
+    return Planted(
+        lambda: report(bench, _ERROR_RESTARTED), lambda: all(bus["state"] == "bus-off" for bus in bench.statistics())
+    )
 
 
 def _queue_full(bench: Bench) -> Planted:
@@ -73,17 +73,12 @@ def _queue_full(bench: Bench) -> Planted:
 def _block(bench: Bench, *, blocked: bool) -> None:
     if bench.twin:
         bench.twin.blocked = "the transmit queue is full" if blocked else ""
-    elif bench.bus:
-        bench.bus.failure = can.CanOperationError("a test", errno.ENOBUFS) if blocked else None
-
-
-def _fail(bench: Bench, number: int) -> None:
-    assert bench.bus is not None
-    bench.bus.failure = can.CanOperationError("a test", number)
+    else:
+        refuse(bench, can.CanOperationError("a test", errno.ENOBUFS) if blocked else None)
 
 
 def _unplugged(bench: Bench) -> None:
-    _fail(bench, errno.ENODEV)
+    refuse(bench, can.CanOperationError("a test", errno.ENODEV))
 
 
 def _blocked(bench: Bench) -> None:
@@ -94,18 +89,18 @@ def _no_sense(bench: Bench) -> Planted:
     """A drive's answers lose their last bytes."""
     if bench.twin:
         return between(bench, Reject())
-    rejected = _count(bench, "rejected")
-    return on_wire(bench, wire.Short(), [_some(bench)], lambda: _count(bench, "rejected") > rejected)
+    rejected = bench.count("rejected")
+    return on_wire(bench, wire.Short(), [_some(bench)], lambda: bench.count("rejected") > rejected)
 
 
 def _flipped(bench: Bench) -> Planted:
     """Every second answer of a drive has a bit flipped on its way."""
-    begun, strange = bench.now_ns, _count(bench, "unexpected")
+    begun, strange = bench.now_ns, bench.count("unexpected")
 
     def showed() -> bool:
         records = bench.since(begun)
         far = np.abs(records["position"] - records["true_position"]).max() > 0.01
-        return bool(far) or _count(bench, "unexpected") > strange
+        return bool(far) or bench.count("unexpected") > strange
 
     return on_wire(bench, wire.Corrupt(probability=0.5), [_some(bench)], showed)
 
@@ -124,31 +119,23 @@ def _on_all(trouble: wire.Trouble, showed: Callable[[Bench, int, int], bool]) ->
     """Return trouble of all motors; `showed` is told how many frames were sent and received meanwhile."""
 
     def plant(bench: Bench) -> Planted:
-        sent, received = _count(bench, "sent"), _count(bench, "received")
+        sent, received = bench.count("sent"), bench.count("received")
         return on_wire(
             bench,
             trouble,
             range(bench.robot.dof),
-            lambda: showed(bench, _count(bench, "sent") - sent, _count(bench, "received") - received),
+            lambda: showed(bench, bench.count("sent") - sent, bench.count("received") - received),
         )
 
     return plant
 
 
 def _late_answers(bench: Bench, _sent: int, _received: int) -> bool:
-    return float(_statistics(bench)["round_trip_us"]["p99"]) > 1e3
+    return all(float(bus["round_trip_us"]["p99"]) > 1e3 for bus in bench.statistics())
 
 
 def _some(bench: Bench) -> int:
     return int(bench.random.integers(bench.robot.dof))
-
-
-def _statistics(bench: Bench) -> dict[str, Any]:
-    return bench.arm.bus_statistics() or {}
-
-
-def _count(bench: Bench, counter: str) -> int:
-    return int(_statistics(bench)[counter])
 
 
 def scenarios(robot: Robot, backend: str) -> list[Scenario]:

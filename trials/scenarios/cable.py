@@ -4,7 +4,6 @@ import errno
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
 
 import can
 
@@ -16,11 +15,10 @@ from robotctl.hal.types import Sample
 from robotctl.safety.trip import Category, Protection
 from robotctl.sim.motors import strangers
 from robotctl.sim.motors import trouble as wire
-from robotctl.sim.motors.bus import EmulatedBus
 from robotctl.sim.motors.damiao import DamiaoDrive
 from robotctl.sim.trouble import Trouble
 from robotctl.trials.bench import Bench
-from robotctl.trials.faults import Planted, between, everywhere, on_canopen, on_wire
+from robotctl.trials.faults import Planted, between, everywhere, on_canopen, on_wire, refuse, report
 from robotctl.trials.orphans import orphan_scenario, without_bus
 from robotctl.trials.scenario import Scenario, Trial
 from robotctl.trials.shaping import tolerated_scenario
@@ -39,9 +37,14 @@ _APART = 0.5
 """rad"""
 
 
-def _bus(bench: Bench) -> EmulatedBus:
-    assert bench.bus is not None
-    return bench.bus
+def _counted(bench: Bench, error: str) -> int:
+    """Return how many error frames of a kind came, on the bus with the fewest."""
+    return min(int(bus["errors"].get(error, 0)) for bus in bench.statistics())
+
+
+def _held_back(bench: Bench) -> bool:
+    """Return whether every bus has kept so many cycles back that it had to be noticed."""
+    return all(bus["send_failures"] >= _UNDELIVERED_TICKS for bus in bench.statistics())
 
 
 def _for(bench: Bench, nanoseconds: int, end: Callable[[], None], showed: Callable[[], bool]) -> Planted:
@@ -63,27 +66,26 @@ def _for(bench: Bench, nanoseconds: int, end: Callable[[], None], showed: Callab
 
 
 def _passive(bench: Bench) -> Planted:
-    bus = _bus(bench)
-    bus.report(ERROR_CONTROLLER, PASSIVE_DATA)
+    report(bench, ERROR_CONTROLLER, PASSIVE_DATA)
     return Planted(
-        lambda: bus.report(ERROR_CONTROLLER, RECOVERED_DATA), lambda: _statistics(bench)["state"] == "passive"
+        lambda: report(bench, ERROR_CONTROLLER, RECOVERED_DATA),
+        lambda: all(bus["state"] == "passive" for bus in bench.statistics()),
     )
 
 
 def _restarting(bench: Bench) -> Planted:
     """The controller leaves the bus, and the kernel restarts it."""
-    bus = _bus(bench)
-    bus.report(ERROR_BUS_OFF)
-    return _for(
-        bench, _SHORT_NS, lambda: bus.report(ERROR_RESTARTED), lambda: _statistics(bench)["errors"].get("bus-off") == 1
-    )
+    report(bench, ERROR_BUS_OFF)
+    return _for(bench, _SHORT_NS, lambda: report(bench, ERROR_RESTARTED), lambda: _counted(bench, "bus-off") == 1)
 
 
 def _noise(bench: Bench) -> Planted:
-    def showed() -> bool:
-        return int(_statistics(bench)["errors"].get("bus error", 0)) > 20
-
-    return on_wire(bench, wire.Unterminated(probability=0.01), everywhere(bench), showed)
+    return on_wire(
+        bench,
+        wire.Unterminated(probability=0.01),
+        everywhere(bench),
+        lambda: _counted(bench, "bus error") > 20,
+    )
 
 
 # -- what does not leave -----------------------------------------------------------------------------------------------
@@ -91,46 +93,41 @@ def _noise(bench: Bench) -> Planted:
 
 def _full_without_number(bench: Bench) -> Planted:
     """What python-can says where `select` finds no room: the same fault, with no errno in it."""
-    bus = _bus(bench)
-    bus.failure = can.CanOperationError("Transmit buffer full")
-
-    def end() -> None:
-        bus.failure = None
-
-    return _for(bench, _SHORT_NS, end, lambda: _statistics(bench)["send_failures"] >= _UNDELIVERED_TICKS)
+    refuse(bench, can.CanOperationError("Transmit buffer full"))
+    return _for(bench, _SHORT_NS, lambda: refuse(bench, None), lambda: _held_back(bench))
 
 
 def _occupied(bench: Bench) -> Planted:
     """A node that babbles with the highest priority leaves no room for anybody else."""
-    bus = _bus(bench)
-    bus.occupied = True
 
-    def end() -> None:
-        bus.occupied = False
+    def occupy(occupied: bool) -> None:
+        for bus in bench.buses:
+            bus.occupied = occupied
 
-    return _for(bench, _SHORT_NS, end, lambda: _statistics(bench)["send_failures"] >= _UNDELIVERED_TICKS)
+    occupy(True)
+    return _for(bench, _SHORT_NS, lambda: occupy(False), lambda: _held_back(bench))
 
 
 def _power_gap(bench: Bench) -> Planted:
     """All drives lose their supply, the gripper's, too, and get it back before the bus is given up."""
-    for drive in bench.motors.drives:
+    for drive in bench.drives:
         drive.power_down()
 
     def end() -> None:
-        for drive in bench.motors.drives:
+        for drive in bench.drives:
             drive.power_up()
 
-    return _for(bench, _CUT_NS, end, lambda: _statistics(bench)["errors"].get("no acknowledgement", 0) > 0)
+    return _for(bench, _CUT_NS, end, lambda: _counted(bench, "no acknowledgement") > 0)
 
 
 def _down(bench: Bench) -> None:
-    _bus(bench).failure = can.CanOperationError("a test", errno.ENETDOWN)
+    refuse(bench, can.CanOperationError("a test", errno.ENETDOWN))
 
 
 def _up_again(bench: Bench, trial: Trial) -> None:
     """The loop ends, and does not go on by itself when the interface is back."""
     without_bus(bench, trial)
-    _bus(bench).failure = None
+    refuse(bench, None)
     with suppress(BusError):
         bench.tick()
         trial.require(False, "the loop went on when the interface was back")
@@ -141,8 +138,8 @@ def _stale(robot: Robot, backend: str, seed: int) -> Trial:
     trial, torque = Trial(), False
     with Bench(robot, backend, seed) as bench:
         running(bench)
-        bus, motors, onset = _bus(bench), bench.motors, bench.now_ns
-        for drive in motors.drives:
+        buses, drives, plant, onset = bench.buses, bench.drives, bench.plant, bench.now_ns
+        for drive in drives:
             drive.power_down()
         with suppress(BusError):
             bench.run(_GIVEN_UP_S)
@@ -152,17 +149,19 @@ def _stale(robot: Robot, backend: str, seed: int) -> Trial:
         trial.require(trips == [("P14", Category.BRAKE_OFF), ("P14", Category.CUT)], f"tripped: {trips}")
         trial.require("take the interface down and up" in bench.trips[-1]["text"], f"said: {bench.trips[-1]['text']}")
         trial.figures["reaction_s"] = (bench.trips[0]["stamp_ns"] - onset) * 1e-9
-        trial.require(bus.waiting(), "no frame waited for the power")
+        trial.require(all(bus.waiting() for bus in buses), "no frame waited for the power")
         with suppress(HardwareError):  # no drive confirms that it is off
             bench.loop.shut_down()
-        witness = bus.witness()
-        for drive in motors.drives:
+        witnesses = [bus.witness() for bus in buses]
+        for drive in drives:
             drive.power_up()
         for _ in range(_WATCH_MS):
             bench.clock.sleep_until(bench.now_ns + 1_000_000)
-            bus.recv(0.0)
-            torque |= bool(motors.plant.truth().effort.any())
-        trial.require(witness.recv(0.0) is None, "old frames were sent when the power came back")
+            for bus in buses:
+                bus.recv(0.0)
+            torque |= bool(plant.truth().effort.any())
+        old = [witness.recv(0.0) for witness in witnesses]
+        trial.require(old == [None] * len(buses), "old frames were sent when the power came back")
         trial.require(not torque, "torque came back")
     trial.seen = "P14, then the bus was given up; nothing old left"
     return trial
@@ -172,54 +171,41 @@ def _stale(robot: Robot, backend: str, seed: int) -> Trial:
 
 
 def _babble(bench: Bench) -> Planted:
-    unexpected = _count(bench, "unexpected")
-    return on_wire(
-        bench, strangers.Babble(), everywhere(bench), lambda: _count(bench, "unexpected") > unexpected + 1000
-    )
+    unexpected = bench.count("unexpected")
+    return on_wire(bench, strangers.Babble(), everywhere(bench), lambda: bench.count("unexpected") > unexpected + 1000)
 
 
 def _impostor(bench: Bench) -> Planted:
     axis = _some(bench)
     joint = bench.robot.profile.joints[axis]
     assert joint.drive is not None
-    drive = bench.motors.drive(joint.name)
+    drive = bench.drive(axis)
     assert isinstance(drive, DamiaoDrive)
     begun = bench.now_ns
-    received = _count(bench, "received")
+    received = bench.count("received")
 
     def showed() -> bool:
         ticks = len(bench.since(begun))
-        return _count(bench, "received") > received + 1.1 * ticks
+        return bench.count("received") > received + 1.1 * ticks
 
     other = strangers.Impostor(offset=_APART * joint.drive.sign * joint.drive.gear, ranges=drive.ranges)
     return on_wire(bench, other, [axis], showed)
 
 
 def _chatter(bench: Bench) -> Planted:
-    axis, rejected = _some(bench), _count(bench, "rejected")
-    return on_wire(bench, strangers.Chatter(), [axis], lambda: _count(bench, "rejected") > rejected)
+    axis, rejected = _some(bench), bench.count("rejected")
+    return on_wire(bench, strangers.Chatter(), [axis], lambda: bench.count("rejected") > rejected)
 
 
 def _late(bench: Bench) -> Planted:
-    missed = int(_statistics(bench)["missed_replies"])
+    missed = bench.count("missed_replies")
     return on_wire(
-        bench,
-        wire.Delay(delay_s=_LATE_S),
-        everywhere(bench),
-        lambda: int(_statistics(bench)["missed_replies"]) > missed,
+        bench, wire.Delay(delay_s=_LATE_S), everywhere(bench), lambda: bench.count("missed_replies") > missed
     )
 
 
 def _some(bench: Bench) -> int:
     return int(bench.random.integers(bench.robot.dof))
-
-
-def _statistics(bench: Bench) -> dict[str, Any]:
-    return bench.arm.bus_statistics() or {}
-
-
-def _count(bench: Bench, counter: str) -> int:
-    return int(_statistics(bench)[counter])
 
 
 def scenarios(robot: Robot, backend: str) -> list[Scenario]:

@@ -9,6 +9,7 @@ from robotctl.hal.can.arm import CanArm
 from robotctl.hal.can.cia402.codec import Mode, Service, Setpoint, encode_setpoint
 from robotctl.hal.can.cia402.machine import Word
 from robotctl.hal.can.damiao.codec import Special, encode_special
+from robotctl.hal.can.joined import JoinedArm
 from robotctl.hal.errors import HardwareError
 from robotctl.hal.profile import Cia402Drive
 from robotctl.hal.robot import Robot
@@ -105,11 +106,12 @@ def _stray(identifier: int, data: bytes) -> Callable[[Bench], Planted]:
 
     def plant(bench: Bench) -> Planted:
         arm = bench.arm.arm
+        if isinstance(arm, JoinedArm):
+            arm = arm.arms[0]
         assert isinstance(arm, CanArm)
-        transport = arm._require_open()
-        before = transport.withheld
-        transport.send(identifier, data)
-        return Planted(lambda: None, lambda: transport.withheld > before)
+        before = bench.count("withheld")
+        arm._require_open().send(identifier, data)
+        return Planted(lambda: None, lambda: bench.count("withheld") > before)
 
     return plant
 

@@ -239,12 +239,14 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         stop_scenario(17, "wrong direction", "a drive pushes the wrong way", _wrong_way, astray),
         stop_scenario(17, "limp drive", "a drive that is on gives no torque", _limp, astray),
         stop_scenario(17, "runaway", "a drive turns with 30 % of its torque by itself", _runaway, astray),
-        stop_scenario(18, "overspeed", "a joint is driven at 1.4 times its cap", _kicked(1.4), overspeed),
+        untouchable(
+            stop_scenario(18, "overspeed", "a joint is driven at 1.45 times its cap", _kicked(1.45), overspeed)
+        ),
         stop_scenario(
             18,
             "far overspeed",
-            "a joint is driven at twice its cap",
-            _kicked(2.0),
+            "a joint is driven at 2.5 times its cap",
+            _kicked(2.5),
             replace(overspeed, category=Category.CUT),
         ),
         stop_scenario(

@@ -79,12 +79,16 @@ class Cia402Arm(CanArm):
         Raises:
             DriveError: if one drive is not as it should be.
             DrivesError: if several are, or one in several ways; it holds them all.
-            BusError: if the bus is gone.
+            BusError: if the bus is gone, nobody is on it, or old frames were sent.
         """
         network = self._require_network()
         self._verified = False
         self.warnings.clear()
         self.identities.clear()
+        commands = {identifier for drive in self._drives for identifier in drive.commands}
+        if self._passenger:
+            commands |= self._passenger.commands
+        network.prove_empty(max(drive.id for drive in self._drives), commands)
         problems: list[DriveError] = []
         for drive, expected in zip(self._drives, self._expected, strict=True):
             identity, found = verify_drive(drive, expected, self.warnings)
@@ -163,8 +167,8 @@ class Cia402Arm(CanArm):
         transport = self._require_open()
         transport.drain()
         now = self._clock.now_ns()
-        if self._verified and not self._enabled and now - self._polled_ns >= _POLL_PERIOD_NS:
-            self._poll(transport, now)
+        if self._verified and not self._enabled and now - self._polled_ns >= _POLL_PERIOD_NS and not transport.waiting:
+            self._poll(transport, now)  # one round may wait for an arm without power, not one after the other
         drives = self._drives
         faults: tuple[Fault, ...] = ()
         for drive in drives:

@@ -163,6 +163,11 @@ class Drive:
             return fault_of(self.name, SILENT)
         return fault_of(self.name, NOT_OPERATIONAL) if self.nmt != Nmt.OPERATIONAL else None
 
+    @property
+    def commands(self) -> set[int]:
+        """The ids of frames that tell it to do something, but for those that go to all drives."""
+        return {self.setpoint_id, self.feed_forward_id, Service.SDO + self.id}
+
     # --- requests: bring-up and shutdown, not for the loop ----------------------------------------------------------
 
     def read(self, entry: Entry) -> int:

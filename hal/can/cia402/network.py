@@ -7,13 +7,14 @@ transport. While anything waits, the host's heartbeat goes on.
 
 import logging
 import queue
+import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from canopen import Network, RemoteNode
 
-from robotctl.hal.can.cia402.codec import HOST_ID, Nmt, Service, encode_heartbeat
-from robotctl.hal.can.cia402.objects import dictionary
+from robotctl.hal.can.cia402.codec import HOST_ID, NMT_ID, SYNC_ID, Nmt, Service, encode_heartbeat
+from robotctl.hal.can.cia402.objects import ERROR_REGISTER, dictionary
 from robotctl.hal.can.transport import Transport
 from robotctl.hal.clock import Clock
 
@@ -27,6 +28,8 @@ TRIES = 5
 # Aborted transfers are raised as well, and without a handler of ours the log would reach the terminal.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
+_QUESTION = struct.pack("<BHB4x", 0x40, ERROR_REGISTER.index, ERROR_REGISTER.sub)
+"""CiA 301, SDO: initiate upload."""
 _BEAT = (Service.HEARTBEAT + HOST_ID, encode_heartbeat(Nmt.OPERATIONAL))
 
 
@@ -40,6 +43,7 @@ class HostNetwork(Network):
         self._clock = clock
         self._beats = beats
         self._beat_ns = clock.now_ns() - HEARTBEAT_NS
+        self._inboxes: dict[int, Inbox] = {}
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send a frame through the transport; one that does not leave is one that is not answered."""
@@ -48,7 +52,7 @@ class HostNetwork(Network):
     def attach(self, node_id: int) -> RemoteNode:
         """Return the node with this id, its SDO replies routed to it. Sends nothing."""
         node = self.add_node(RemoteNode(node_id, dictionary()))
-        node.sdo.responses = Inbox(self.wait)
+        node.sdo.responses = self._inboxes[node_id] = Inbox(self.wait)
         node.sdo.MAX_RETRIES = TRIES
         node.sdo.RESPONSE_TIMEOUT = REPLY_TIMEOUT_S
         reply_id = Service.SDO_REPLY + node_id
@@ -61,6 +65,16 @@ class HostNetwork(Network):
 
         self.transport.by_id[reply_id] = take
         return node
+
+    def prove_empty(self, node_id: int, commands: Collection[int]) -> None:
+        """As `Transport.prove_empty`, by asking a node for its error register, which nobody else does.
+
+        Waits for the answer, which would else be taken for that to the next request.
+        """
+        inbox = self._inboxes[node_id]
+        inbox.empty()
+        if self.transport.prove_empty((Service.SDO + node_id, _QUESTION), {NMT_ID, SYNC_ID, *commands}):
+            self.wait(lambda: inbox.is_filled, REPLY_TIMEOUT_S)
 
     def beat(self) -> list[tuple[int, bytes]]:
         """Return the heartbeat if it is due, as a frame to send at once."""
@@ -101,12 +115,17 @@ class Inbox:
         self._frames.clear()
         return True
 
+    @property
+    def is_filled(self) -> bool:
+        """Whether an answer has come that nobody has taken."""
+        return bool(self._frames)
+
     def get(self, block: bool = True, timeout: float | None = None) -> bytes:
         """Return the next frame.
 
         Raises:
             queue.Empty: if none comes in time.
         """
-        if not self._wait(lambda: bool(self._frames), timeout or 0.0):
+        if not self._wait(lambda: self.is_filled, timeout or 0.0):
             raise queue.Empty
         return self._frames.popleft()

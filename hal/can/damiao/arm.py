@@ -105,7 +105,8 @@ class DamiaoArm(CanArm):
         self._verified = False
         self.warnings.clear()
         self.identities.clear()
-        transport.prove_empty(self._drives[0].question, {drive.id for drive in self._drives})
+        commands = {identifier for drive in self._drives for identifier in drive.commands}
+        transport.prove_empty(self._drives[0].question, commands)
         others = Eavesdropper()
         transport.listener = others
         problems: list[DriveError] = []

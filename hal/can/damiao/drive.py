@@ -10,6 +10,7 @@ from robotctl.hal.can.damiao.codec import (
     BROADCAST_ID,
     KD_MAX,
     KP_MAX,
+    Offset,
     RegisterCommand,
     Special,
     Status,
@@ -284,6 +285,11 @@ class Drive:
             if self._transport.wait(lambda before=before: self.heard > before, REPLY_TIMEOUT_S):  # type: ignore[misc]
                 return
         raise self.silent()
+
+    @property
+    def commands(self) -> set[int]:
+        """The ids of frames that tell it to do something, as an arm's drive or a gripper's."""
+        return {self.id, Offset.POS_FORCE + self.id}
 
     @property
     def question(self) -> tuple[int, bytes]:

@@ -38,6 +38,11 @@ class Passenger:
         self.gripper.attach(self.drive, transport)
 
     @property
+    def commands(self) -> set[int]:
+        """The ids of frames that tell the drive to do something."""
+        return self._require().commands
+
+    @property
     def is_on(self) -> bool:
         return self._require().status == Status.ENABLED
 
