@@ -11,6 +11,7 @@ from typing import NamedTuple, Self
 
 import can
 
+from robotctl.hal.can.bus_ids import tag
 from robotctl.hal.can.cia402.codec import HOST_ID, SETPOINT, Mode, Service
 from robotctl.hal.can.cia402.machine import Word
 from robotctl.hal.can.damiao.codec import Special
@@ -34,6 +35,7 @@ class Heard(NamedTuple):
     at_s: float
     """By the drives' own clock."""
     motor: int
+    """Its id, with its bus in it: see `hal.can.bus_ids`."""
     kind: str
     """track, damp, or the special command's name."""
 
@@ -44,7 +46,7 @@ class Emulator:
     def __init__(self, folder: Path, robot: Robot, watchdog_s: float) -> None:
         """Start them, with this watchdog in every drive, and their logs in a folder."""
         self._canopen = on_canopen(robot)
-        self._ids = {joint.drive.id for joint in robot.profile.joints if joint.drive}
+        self._ids = {tag(joint.drive.bus, joint.drive.id) for joint in robot.profile.joints if joint.drive}
         self._told = folder / "emulate.log"
         self._frames = folder / "bus.log"
         command = [sys.executable, "-m", "robotctl.cli.main", "emulate"]
@@ -92,11 +94,12 @@ class Emulator:
     def heard(self) -> list[Heard]:
         """Return what the joints' drives were sent."""
         base, kind = (Service.RPDO1, _kind_402) if self._canopen else (0, _kind)
-        return [
-            Heard(frame.timestamp, frame.arbitration_id - base, kind(bytes(frame.data)))
+        motors = [
+            (tag(int(frame.channel.removeprefix("can")), frame.arbitration_id - base), frame)
             for frame in can.LogReader(self._frames)
-            if frame.arbitration_id - base in self._ids
+            if frame.arbitration_id >= base
         ]
+        return [Heard(frame.timestamp, motor, kind(bytes(frame.data))) for motor, frame in motors if motor in self._ids]
 
 
 def _kind(data: bytes) -> str:

@@ -1,6 +1,6 @@
 """Trouble and register presets as words on a command line."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 
 from robotctl.hal.can.cia402.objects import Entry
 from robotctl.hal.can.damiao.registers import REGISTERS
@@ -54,6 +54,17 @@ REGISTER_FORM = (
     "MOTOR:REGISTER=VALUE, where MOTOR is a joint's name, an id or `all`, and REGISTER a number or a name, or the "
     "INDEX or INDEX.SUB of an object of a CiA 402 drive"
 )
+
+
+def give_orders(benches: Sequence[Bench], registers: Iterable[str], troubles: Iterable[str]) -> None:
+    """Do what orders ask for on every bus that has the motor. Raises as `order_register` and `order_trouble` do."""
+    for order in registers:
+        for bench in _meant(benches, order.partition(":")[0]):
+            order_register(bench, order)
+    for order in troubles:
+        _, _, rest = order.partition("@")[0].partition(":")
+        for bench in _meant(benches, rest.partition(":")[0]):
+            order_trouble(bench, order)
 
 
 def order_trouble(bench: Bench, order: str) -> None:
@@ -119,6 +130,18 @@ def _entry(drive: Cia402Drive, name: str) -> Entry:
     """Return an object of a CiA 402 drive, by INDEX or INDEX.SUB; LookupError if it has none such."""
     index, _, sub = name.partition(".")
     return drive.dictionary.entries[int(index, 0), int(sub, 0) if sub else 0]
+
+
+def _meant(benches: Sequence[Bench], word: str) -> list[Bench]:
+    """Return the benches that have a motor; the first one where none has, since it will tell."""
+    return [bench for bench in benches if word == "all" or _has(bench, word)] or [benches[0]]
+
+
+def _has(bench: Bench, word: str) -> bool:
+    try:
+        return bool(_motors(bench, word))
+    except ConfigError:
+        return False
 
 
 def _motors(bench: Bench, word: str) -> list[EmulatedDrive]:

@@ -1,16 +1,36 @@
 """A channel's name, opened as a port for emulated drives to be served on."""
 
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import can
 
-from robotctl.hal.can.channel import open_bus, options
+from robotctl.hal.can.channel import open_bus, options, split_channels
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.robot import Robot
 from robotctl.sim.motors.server import BusPort, Port
 from robotctl.sim.motors.terminal import SlcanPort
 
 _FD_MTU = 72
+
+
+def open_ports(channel: str, robot: Robot, adapters: int = 1) -> list[Port]:
+    """Open a port for each bus of a robot: channels with commas between them, or slcan for all. Raises as `open_port`.
+
+    If one cannot be opened, none stays open.
+    """
+    buses = robot.profile.buses
+    names = [channel] * buses if channel == "slcan" else split_channels(channel)
+    if len(names) != buses:
+        raise ConfigError(
+            f"robot {robot.profile.name!r} is on {buses} {'bus' if buses == 1 else 'buses'}, and --channel "
+            f"{channel!r} names {len(names)}",
+            "name one channel for each, with commas between them, or use slcan",
+        )
+    with ExitStack() as stack:
+        ports = [stack.enter_context(closing(open_port(name, robot, adapters))) for name in names]
+        stack.pop_all()
+    return ports
 
 
 def open_port(channel: str, robot: Robot, adapters: int = 1) -> Port:

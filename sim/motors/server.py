@@ -1,7 +1,7 @@
 """Serves emulated drives to other processes, in real time, on any channel that frames can come from."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import can
@@ -113,10 +113,32 @@ class BusPort:
         time.sleep(POLL_S)
 
 
+class Pace:
+    """Lets time pass for drives as it does for their hosts: for those of all buses of a robot together."""
+
+    def __init__(self, clock: Clock, advance: Callable[[int], None], start_ns: int) -> None:
+        """Take a clock, and what lets time pass until a time in ns of the drives' own, now at `start_ns`."""
+        self._clock = clock
+        self._advance = advance
+        self._drives_ns = start_ns
+        self._round_ns = clock.now_ns()
+
+    def begin(self) -> None:
+        """Forget the time until now."""
+        self._round_ns = self._clock.now_ns()
+
+    def catch_up(self) -> None:
+        """Let the time pass that has passed since the last call."""
+        now = self._clock.now_ns()
+        self._drives_ns += min(now - self._round_ns, LATE_NS)
+        self._round_ns = now
+        self._advance(self._drives_ns)
+
+
 class Server:
     """A bench behind a port. Any number of clients may share the port; all of them see every reply, as on a bus."""
 
-    def __init__(self, bench: Bench, port: Port, clock: Clock) -> None:
+    def __init__(self, bench: Bench, port: Port, pace: Pace) -> None:
         self.received = 0
         self.answered = 0
         self.lost = 0
@@ -127,27 +149,14 @@ class Server:
         """Called for every frame in either direction, with the drives' time of it."""
         self._bench = bench
         self._port = port
-        self._clock = clock
-        self._round_ns = clock.now_ns()
+        self._pace = pace
         self._statuses = [drive.status for drive in bench.drives]
-
-    def serve(self, is_over: Callable[[], bool]) -> None:
-        """Serve until `is_over()`.
-
-        Raises:
-            BusError: if the channel is gone.
-        """
-        self._round_ns = self._clock.now_ns()
-        while not is_over():
-            self.step()
 
     def step(self) -> None:
         """Wait for frames, let time pass, and answer."""
         frames = self._port.receive(POLL_S)
-        now = self._clock.now_ns()
+        self._pace.catch_up()
         bench = self._bench
-        bench.advance(bench.now_ns + min(now - self._round_ns, LATE_NS))
-        self._round_ns = now
         for frame in frames:
             if frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id:
                 continue
@@ -193,3 +202,15 @@ class Server:
             if drive.status != self._statuses[index]:
                 before, self._statuses[index] = self._statuses[index], drive.status
                 report(drive, before, (self._bench.now_ns - drive.fed_ns) * 1e-9)
+
+
+def serve(servers: Sequence[Server], pace: Pace, is_over: Callable[[], bool]) -> None:
+    """Serve several buses until `is_over()`.
+
+    Raises:
+        BusError: if a channel is gone.
+    """
+    pace.begin()
+    while not is_over():
+        for server in servers:
+            server.step()

@@ -10,14 +10,14 @@ from robotctl.sim.plant import PHYSICS_STEP_NS
 class SharedPlant:
     """The benches of all buses of a robot, in front of one plant."""
 
-    def __init__(self, robot: Robot, start_ns: int = 0) -> None:
-        """Build the plant and all drives.
+    def __init__(self, robot: Robot, start_ns: int = 0, fd: bool | None = None, seed: int = 0) -> None:
+        """Build the plant and all drives; see `Bench`.
 
         Raises:
             ConfigError: if the robot has no CAN drives.
         """
-        first = Bench(robot, start_ns)
-        others = [Bench(robot, start_ns, bus=bus, plant=first.plant) for bus in range(1, robot.profile.buses)]
+        first = Bench(robot, start_ns, fd, seed)
+        others = [Bench(robot, start_ns, fd, seed, bus, first.plant) for bus in range(1, robot.profile.buses)]
         self.benches: Sequence[Bench] = (first, *others)
         self._now_ns = start_ns
 

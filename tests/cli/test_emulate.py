@@ -39,8 +39,15 @@ def test_report(tmp_path: Path, options: list[str], fd: bool) -> None:
     assert report["channel"] in result.output
     assert [motor["fd"] for motor in report["motors"]] == [fd] * 8
     assert report["motors"][7] == {
-        "joint": "gripper", "id": 8, "reply_id": 0x18, "model": "DM4310", "fd": fd, "status": 0, "flash_cycles": 0,
-    }  # fmt: skip
+        "joint": "gripper",
+        "bus": 0,
+        "id": 8,
+        "reply_id": 0x18,
+        "model": "DM4310",
+        "fd": fd,
+        "status": 0,
+        "flash_cycles": 0,
+    }
 
 
 def test_can_fd_where_none_passes_is_refused():

@@ -20,7 +20,7 @@ from robotctl.hal.errors import DriveError
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Command, CommandMode
 from robotctl.sim.motors.bench import Bench
-from robotctl.sim.motors.server import BusPort, Server
+from robotctl.sim.motors.server import BusPort, Pace, Server, serve
 
 pytestmark = pytest.mark.realtime
 
@@ -140,8 +140,9 @@ def served(xarm7: Robot) -> Iterator[tuple[str, Bench]]:
     bench = Bench(xarm7, clock.now_ns())
     bus = can.Bus(interface="virtual", channel=name)
     over = threading.Event()
-    server = Server(bench, BusPort(name, bus, fd=False), clock)
-    thread = threading.Thread(target=server.serve, args=(over.is_set,))
+    pace = Pace(clock, bench.advance, bench.now_ns)
+    server = Server(bench, BusPort(name, bus, fd=False), pace)
+    thread = threading.Thread(target=serve, args=([server], pace, over.is_set))
     thread.start()
     yield name, bench
     over.set()

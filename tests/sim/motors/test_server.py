@@ -19,24 +19,37 @@ from robotctl.hal.can.damiao.codec import (
 )
 from robotctl.hal.can.damiao.registers import Register
 from robotctl.hal.can.error_frames import UNACKNOWLEDGED
-from robotctl.hal.clock import MonotonicClock, VirtualClock
+from robotctl.hal.clock import Clock, MonotonicClock, VirtualClock
 from robotctl.hal.errors import BusError, ConfigError
-from robotctl.hal.robot import Robot
+from robotctl.hal.robot import Robot, load_robot
 from robotctl.sim.motors.bench import Bench
-from robotctl.sim.motors.ports import open_port
-from robotctl.sim.motors.server import BusPort, Port, Server
+from robotctl.sim.motors.orders import give_orders
+from robotctl.sim.motors.ports import open_port, open_ports
+from robotctl.sim.motors.server import BusPort, Pace, Port, Server, serve
+from robotctl.sim.motors.shared_plant import SharedPlant
 from robotctl.sim.motors.terminal import SlcanPort
 from robotctl.sim.motors.trouble import PowerCut
 
 MS = 1_000_000
 
 
+@pytest.fixture(scope="module")
+def bimanual() -> Robot:
+    return load_robot("openarm_bimanual")
+
+
+def paced(bench: Bench, clock: Clock) -> Pace:
+    return Pace(clock, bench.advance, bench.now_ns)
+
+
 @contextmanager
 def serving(robot: Robot, port: Port, fd: bool) -> Iterator[Server]:
     clock = MonotonicClock()
-    server = Server(Bench(robot, clock.now_ns(), fd), port, clock)
+    bench = Bench(robot, clock.now_ns(), fd)
+    pace = paced(bench, clock)
+    server = Server(bench, port, pace)
     over = threading.Event()
-    thread = threading.Thread(target=server.serve, args=(over.is_set,))
+    thread = threading.Thread(target=serve, args=([server], pace, over.is_set))
     thread.start()
     try:
         yield server
@@ -119,8 +132,8 @@ class Stub:
 
 
 def test_drives_stand_still_while_the_server_does_not_run(panda: Robot) -> None:
-    clock, port = VirtualClock(), Stub()
-    server = Server(Bench(panda), port, clock)
+    clock, port, bench = VirtualClock(), Stub(), Bench(panda)
+    server = Server(bench, port, paced(bench, clock))
     port.incoming = [frame(1, encode_special(Special.ENABLE))]
     server.step()
     clock.sleep_until(10_000 * MS)
@@ -131,8 +144,8 @@ def test_drives_stand_still_while_the_server_does_not_run(panda: Robot) -> None:
 
 
 def test_whoever_listens_hears_both_directions_in_the_drives_own_time(panda: Robot) -> None:
-    clock, port = VirtualClock(), Stub()
-    server = Server(Bench(panda, fd=False), port, clock)
+    clock, port, bench = VirtualClock(), Stub(), Bench(panda, fd=False)
+    server = Server(bench, port, paced(bench, clock))
     heard: list[tuple[float, int]] = []
     server.on_frame = lambda seen: heard.append((seen.timestamp, seen.arbitration_id))
     clock.sleep_until(5 * MS)
@@ -142,8 +155,8 @@ def test_whoever_listens_hears_both_directions_in_the_drives_own_time(panda: Rob
 
 
 def test_fd_replies_are_lost_on_a_classic_port(panda: Robot) -> None:
-    port = Stub(fd=False)
-    server = Server(Bench(panda, fd=True), port, VirtualClock())
+    port, bench = Stub(fd=False), Bench(panda, fd=True)
+    server = Server(bench, port, paced(bench, VirtualClock()))
     port.incoming = [frame(1)]
     server.step()
     assert port.outgoing == []
@@ -156,14 +169,14 @@ def test_hosts_are_told_what_their_controller_would_have_seen_where_that_can_be(
     port.carries_errors = carries
     bench.trouble.add(PowerCut())
     port.incoming = [frame(1)]
-    Server(bench, port, VirtualClock()).step()
+    Server(bench, port, paced(bench, VirtualClock())).step()
     told = [(message.arbitration_id, message.is_error_frame) for message in port.outgoing]
     assert told == ([(UNACKNOWLEDGED.error_class, True)] if carries else [])
 
 
 def test_drives_hear_the_bit_rate_of_the_host_alone(panda: Robot) -> None:
     port, bench = Stub(), Bench(panda, fd=False)
-    server = Server(bench, port, VirtualClock())
+    server = Server(bench, port, paced(bench, VirtualClock()))
     bench.drive(1).preset(Register.CAN_BR, 3)
     for bitrate, answers in ((500_000, [0x11]), (1_000_000, []), (250_000, [])):
         port.bitrate, port.incoming, port.outgoing = bitrate, [frame(1)], []
@@ -217,3 +230,38 @@ def test_a_host_that_does_not_read_loses_frames_and_nothing_else() -> None:
         assert port.send(frame(0x11))
     finally:
         port.close()
+
+
+def test_time_passes_for_the_drives_of_two_buses_together(bimanual: Robot) -> None:
+    clock, ports, plant = VirtualClock(), [Stub(), Stub()], SharedPlant(bimanual, fd=False)
+    pace = Pace(clock, plant.advance, 0)
+    servers = [Server(bench, port, pace) for bench, port in zip(plant.benches, ports, strict=True)]
+    for _ in range(3):
+        clock.sleep_until(clock.now_ns() + 5 * MS)
+        for server in servers:
+            server.step()
+    assert [bench.now_ns for bench in plant.benches] == [15 * MS] * 2
+    ports[1].incoming = [frame(1)]
+    for server in servers:
+        server.step()
+    assert [[reply.arbitration_id for reply in port.outgoing] for port in ports] == [[], [0x11]]
+
+
+def test_every_bus_of_a_robot_has_a_port(bimanual: Robot) -> None:
+    ports = open_ports("virtual:port-a,virtual:port-b", bimanual)
+    assert [port.name for port in ports] == ["virtual:port-a", "virtual:port-b"]
+    for port in ports:
+        port.close()
+    with pytest.raises(ConfigError, match=r"(?s)on 2 buses, and --channel 'virtual:port-a' names 1.*with commas"):
+        open_ports("virtual:port-a", bimanual)
+
+
+def test_orders_go_to_the_buses_that_have_the_motor(bimanual: Robot) -> None:
+    plant = SharedPlant(bimanual, fd=False)
+    give_orders(plant.benches, ["all:TIMEOUT=200", "openarm_left_joint3:TIMEOUT=300"], ["powercut:gripper"])
+    right, left = ([drive.memory[Register.TIMEOUT] for drive in bench.drives] for bench in plant.benches)
+    assert (right, left) == ([200] * 8, [200, 200, 300, 200, 200, 200, 200])
+    plant.advance(MS)
+    assert [drive.name for bench in plant.benches for drive in bench.drives if not drive.powered] == ["gripper"]
+    with pytest.raises(ConfigError, match="no motor 'elbow'"):
+        give_orders(plant.benches, ["elbow:TIMEOUT=200"], [])
