@@ -158,6 +158,7 @@ class Loop:
         if self._frames is not None:
             self._frames.mark(now)
         self._guard.observe(sample, now, self.lateness_ns)
+        self._take_refusal(now)  # of something else than this tick's motion, which is sent, and brakes
         tool = self.kinematics.tool(sample.position)
         motion.observer.step(sample)
         reference = motion.reference
@@ -202,8 +203,9 @@ class Loop:
         periods = 1 + min(self.skipped, _LARGEST_GAP)
         brakes = supervisor.category is Category.BRAKE_OFF
         self._write(motion.track(wanted, sample, brake=brakes, periods=periods))
-        if self._take_refusal(now):
-            # What the guard refused is taken back, and the braking that it asked for begins in this very tick.
+        if self._take_refusal(now) and not self._guard.passed:
+            # What the guard refused is taken back, and the braking that it asked for begins in this very tick. If a
+            # motion has left already, it begins from there, in the next one.
             motion.take_back()
             self._write(motion.track(motion.rest, sample, brake=True))
             if self._take_refusal(now):

@@ -93,6 +93,11 @@ class Guard:
         refusal, self._refusal = self._refusal, None
         return refusal
 
+    @property
+    def passed(self) -> bool:
+        """Whether a motion has left since the tick began."""
+        return self._passed
+
     # -- what may leave -------------------------------------------------------------------------------------------
 
     def enabling(self) -> str:

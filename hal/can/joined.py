@@ -21,6 +21,7 @@ from robotctl.hal.errors import BusError, ConfigError, HardwareError
 from robotctl.hal.robot import Robot
 from robotctl.hal.types import Command, Fault, GripperSample, Sample, Sent, Truth
 
+_REMEDY = "check the adapter, then connect again"
 _GONE = 0x80
 """Code of the fault. No controller reports it: there is none any more."""
 _COUNTERS = ("sent", "received", "error_frames", "unexpected", "rejected", "withheld", "send_failures")
@@ -139,7 +140,7 @@ class JoinedArm(Arm):
             self.attempt(bus, lambda bus=bus, arm=arm: self._read(bus, arm))  # type: ignore[misc]
         samples = [sample for sample in self._samples if sample is not None]
         if len(samples) < len(self.arms):
-            raise BusError(next(filter(None, self.lost)), "check the adapter, then connect again")
+            raise BusError(next(filter(None, self.lost)), _REMEDY)
         order = self._order
         here = [sample for sample, why in zip(samples, self.lost, strict=True) if not why]
         faults = tuple(fault for sample in here for fault in sample.faults)
@@ -159,6 +160,8 @@ class JoinedArm(Arm):
     def write(self, command: Command) -> Sent:
         """Send one frame per joint, on all buses or on none: a refusal keeps all of them back."""
         here = [bus for bus, why in enumerate(self.lost) if not why]
+        if not here:
+            raise BusError(self.lost[0], _REMEDY)
         try:
             parts = self._parts(command)
             if not self._enabled:
@@ -227,6 +230,8 @@ class JoinedArm(Arm):
             BusError: if that was the last one.
         """
         if self.lost[bus]:
+            if all(self.lost):
+                raise BusError(self.lost[bus], _REMEDY)
             return
         try:
             action()

@@ -7,11 +7,21 @@ import numpy as np
 import pytest
 
 from robotctl.hal.errors import BusError
-from robotctl.hal.robot import Robot
+from robotctl.hal.robot import Robot, load_robot
 from robotctl.safety.machine import State
 from robotctl.safety.trip import Category
 from robotctl.trials.bench import Bench
+from robotctl.trials.scenarios import scenarios
 from robotctl.trials.stops import running
+
+
+@pytest.mark.parametrize("name", ["one bus lost", "down and up", "stale frames", "foreign id"])
+def test_two_arms_in_one_session_are_stopped_together(name: str) -> None:
+    robot = load_robot("openarm_bimanual")
+    scenario = next(each for each in scenarios(robot, "can") if each.name == name)
+    trial = scenario.run(robot, "can", 0)
+    assert trial.problems == []
+    assert trial.seen
 
 
 def test_one_bus_is_lost_and_the_other_arm_goes_on(panda: Robot) -> None:

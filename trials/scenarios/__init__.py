@@ -17,6 +17,7 @@ from robotctl.trials.scenarios import (
     policy,
     processes,
     proximity,
+    several_buses,
     weights,
 )
 
@@ -28,6 +29,7 @@ _MODULES = (
     machine,
     bus,
     cable,
+    several_buses,
     operator,
     contact,
     proximity,

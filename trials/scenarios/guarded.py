@@ -159,7 +159,8 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
     def bug(
         protection: Protection, name: str, provoked: str, fault: Callable[[Bench], Planted], start: Start = running
     ) -> Scenario:
-        expected = Expected(protection=protection, category=Category.BRAKE_OFF, clears=Clears.POWER)
+        stop = Category.BRAKE_OFF
+        expected = Expected(protection=protection, category=stop, ends=stop, clears=Clears.POWER)
         return stop_scenario(protection.value, name, f"a bug: {provoked}", fault, expected, start)
 
     # On the wire the drives hold from the moment on at which they come on, so that it is a jump like any other.

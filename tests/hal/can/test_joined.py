@@ -151,6 +151,10 @@ def test_the_last_bus_lost_is_an_error(session: Session):
     session.bus(0).failure = session.bus(1).failure = UNPLUGGED
     with pytest.raises(BusError, match="gone"):
         session.advance(0.01)
+    session.bus(0).failure = session.bus(1).failure = None
+    for action in (session.arm.read, session.arm.hold):  # nothing goes on by itself when they are back
+        with pytest.raises(BusError, match="connect again"):
+            action()
 
 
 def test_what_the_black_box_keeps_of_two_buses_decodes_into_what_was_seen(session: Session):
