@@ -122,6 +122,12 @@ def test_our_driver_brings_up_leads_and_switches_off_their_drives(xarm7: Robot) 
             lambda: arm.write(target).delivered and bool(np.allclose(arm.read().position, home + 0.05, atol=1e-5))
         )
         assert arm.read().enabled
+        drives[4].node.emcy.send(0x8611)
+        assert until(
+            lambda: [(fault.joint, fault.name) for fault in arm.read().faults] == [("joint5", "FOLLOWING_ERROR")]
+        )
+        drives[4].node.emcy.reset()
+        assert until(lambda: not arm.read().faults)
         arm.disable()
         assert {drive.words[-1] for drive in drives} == {0}
         drives[2].put(0x1016, 1, 0)
