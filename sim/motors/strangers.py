@@ -1,17 +1,10 @@
 """Trouble from others on the bus: nodes that talk too much, that have our id, or that talk with our drives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from random import Random
 
-from robotctl.hal.can.damiao.codec import (
-    RegisterCommand,
-    decode_feedback,
-    encode_feedback,
-    encode_register,
-    is_feedback,
-)
-from robotctl.hal.can.damiao.motors import Ranges
+from robotctl.hal.can.damiao.codec import RegisterCommand, encode_register
 from robotctl.hal.can.damiao.registers import Register
 from robotctl.sim.motors.drive import Reply
 from robotctl.sim.motors.trouble import Trouble
@@ -44,18 +37,11 @@ class Impostor(Trouble):
 
     offset: float = 1.0
     """rad of the motor"""
-    ranges: Ranges
-    """Of both."""
+    tell: Callable[[Reply, float], Reply]
+    """Returns what a reply would be from so far away."""
 
     def alter(self, replies: Sequence[Reply], random: Random) -> Sequence[Reply]:
-        return [answer for reply in replies for answer in (reply, self._other(reply))]
-
-    def _other(self, reply: Reply) -> Reply:
-        if self.motor_id is None or not is_feedback(reply.data, self.motor_id):
-            return reply
-        feedback = decode_feedback(reply.data, self.ranges)
-        other = feedback._replace(position=feedback.position + self.offset, velocity=0.0)
-        return reply._replace(data=encode_feedback(other, self.ranges))
+        return [answer for reply in replies for answer in (reply, self.tell(reply, self.offset))]
 
 
 @dataclass(frozen=True, kw_only=True)

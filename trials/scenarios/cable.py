@@ -15,7 +15,6 @@ from robotctl.hal.types import Sample
 from robotctl.safety.trip import Category, Protection
 from robotctl.sim.motors import strangers
 from robotctl.sim.motors import trouble as wire
-from robotctl.sim.motors.damiao import DamiaoDrive
 from robotctl.sim.trouble import Trouble
 from robotctl.trials.bench import Bench
 from robotctl.trials.faults import Planted, between, everywhere, on_canopen, on_wire, refuse, report
@@ -180,7 +179,6 @@ def _impostor(bench: Bench) -> Planted:
     joint = bench.robot.profile.joints[axis]
     assert joint.drive is not None
     drive = bench.drive(axis)
-    assert isinstance(drive, DamiaoDrive)
     begun = bench.now_ns
     received = bench.count("received")
 
@@ -188,7 +186,7 @@ def _impostor(bench: Bench) -> Planted:
         ticks = len(bench.since(begun))
         return bench.count("received") > received + 1.1 * ticks
 
-    other = strangers.Impostor(offset=_APART * joint.drive.sign * joint.drive.gear, ranges=drive.ranges)
+    other = strangers.Impostor(offset=_APART * joint.drive.sign * joint.drive.gear, tell=drive.shifted)
     return on_wire(bench, other, [axis], showed)
 
 
@@ -262,13 +260,13 @@ def scenarios(robot: Robot, backend: str) -> list[Scenario]:
         orphan_scenario(14, "down and up", "the interface goes down, and up again", _down, _up_again),
         tolerated_scenario(14, "error frames", "1 % of all frames are broken on the wire", _noise),
         tolerated_scenario(15, "babbling", "a node sends three frames beside every answer", _babble),
-    ]
-    if on_canopen(robot):
-        return found
-    return [
-        *found,
         stop_scenario(
             15, "wrong node", "a second motor with the same ids answers, too", _impostor, senseless.losing_torque(robot)
         ),
+    ]
+    if on_canopen(robot):  # SDO answers and PDOs have ids of their own
+        return found
+    return [
+        *found,
         stop_scenario(15, "look-alikes", "another program reads a drive's registers", _chatter, senseless),
     ]

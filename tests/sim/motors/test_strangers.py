@@ -30,8 +30,9 @@ def test_a_babbling_node_sends_beside_every_answer(panda: Robot) -> None:
 
 
 def test_an_impostor_answers_from_elsewhere_on_the_same_id(panda: Robot) -> None:
-    ranges = Bench(panda).drive(MOTOR).ranges
-    (one, ours), (other, theirs) = answers(panda, Impostor(motor_id=MOTOR, offset=0.5, ranges=ranges))
+    drive = Bench(panda).drive(MOTOR)
+    ranges = drive.ranges
+    (one, ours), (other, theirs) = answers(panda, Impostor(motor_id=MOTOR, offset=0.5, tell=drive.shifted))
     assert one == other == 0x13
     ours, theirs = decode_feedback(ours, ranges), decode_feedback(theirs, ranges)
     assert theirs.position - ours.position == pytest.approx(0.5, abs=1e-3)
