@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from robotctl.hal.can.damiao.codec import Special, decode_feedback, is_feedback
 from robotctl.hal.can.damiao.motors import MOTORS
+from robotctl.hal.robot import CONFIGS
 
 KILLS = int(os.environ.get("ROBOTCTL_KILLS", "1"))
 MOMENTS = [random.Random(seed).uniform(0.0, 1.5) for seed in range(KILLS)]
@@ -185,6 +187,14 @@ def _session(pid: int) -> list[int]:
         if f'"operator": {pid}' in command or f'"parent": {pid}' in command:
             found += [int(entry.name)] if state != "Z" else []
     return found
+
+
+@pytest.fixture
+def brief(tmp_path: Path) -> tuple[str, str]:
+    """Options that make episodes of a task end after 3 s."""
+    path = tmp_path / "brief.yaml"
+    path.write_text(re.sub("steps: 150", "steps: 60", (CONFIGS / "tasks" / "reach.yaml").read_text()))
+    return "--task", str(path)
 
 
 @pytest.fixture

@@ -73,6 +73,7 @@ def test_a_suspended_loop_stops_the_arm_and_does_not_move_it_again(start: Any, b
     assert run.left_behind() == []
 
 
+@pytest.mark.alone
 def test_an_overloaded_machine_harms_nothing(start: Any) -> None:
     run = start("--policy", "random", "--episodes", "2")
     run.wait_running()
