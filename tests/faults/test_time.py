@@ -18,7 +18,7 @@ from robotctl.control.recorded import read_recording
 
 from .conftest import Emulator
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.alone]
 
 UNHARMED = {"position": 0, "velocity": 0, "sphere": 0}
 SPIN = """
@@ -73,7 +73,6 @@ def test_a_suspended_loop_stops_the_arm_and_does_not_move_it_again(start: Any, b
     assert run.left_behind() == []
 
 
-@pytest.mark.alone
 def test_an_overloaded_machine_harms_nothing(start: Any) -> None:
     run = start("--policy", "random", "--episodes", "2")
     run.wait_running()

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.realtime
 def test_bad_weights_cost_an_episode_and_the_run_goes_on_with_the_old_ones(
     start: Any, brief: tuple[str, str], tmp_path: Path
 ) -> None:
-    robot, path = load_robot("panda", [PATIENT]), tmp_path / "policy.npz"
+    robot, path = load_robot("panda", PATIENT), tmp_path / "policy.npz"
     untrained(robot, 0).save(path)
     run = start("--policy", str(path), "--episodes", "3", *brief)
     run.wait_running()
