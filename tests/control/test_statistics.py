@@ -94,3 +94,4 @@ def test_a_run_without_end_keeps_the_latest_values_and_no_more(monkeypatch):
         assert sorted(tail.values) == list(range(max(0, value + 30 - 1000), value + 30))
     tail.take(np.arange(5000))
     assert sorted(tail.values) == list(range(4000, 5000))
+    assert tail.report_us()["max"] == 100.0  # of all there ever were, 99,989 ns
