@@ -25,30 +25,33 @@ def percentiles_us(nanoseconds: NDArray[Any]) -> dict[str, float] | None:
 
 
 class Tail:
-    """The latest values of a series that has no end."""
+    """The latest `REMEMBERED` values of a series that has no end, in no order."""
 
     def __init__(self) -> None:
-        self._values = np.empty(0, dtype=np.int64)
+        self._ring = np.zeros(REMEMBERED, dtype=np.int64)
         self._count = 0
+        self._largest = 0
 
     def take(self, values: NDArray[Any]) -> None:
-        """Add values, forgetting the oldest beyond `REMEMBERED`."""
-        if self._count + len(values) > len(self._values):
-            kept = self.values[-REMEMBERED:]
-            self._values = np.empty(2 * (len(kept) + len(values)), dtype=np.int64)
-            self._values[: len(kept)] = kept
-            self._count = len(kept)
-        self._values[self._count : self._count + len(values)] = values
-        self._count += len(values)
+        """Add at least one value, in place of the oldest."""
+        self._largest = max(self._largest, int(values.max()))
+        kept = values[-REMEMBERED:]
+        self._ring[np.arange(self._count, self._count + len(kept)) % REMEMBERED] = kept
+        self._count += len(kept)
 
     @property
     def values(self) -> NDArray[Any]:
-        """The latest values, at least `REMEMBERED` of them if there were as many."""
-        return self._values[: self._count]
+        """What is remembered; fewer as long as there were fewer."""
+        return self._ring[: self._count]
+
+    def report_us(self) -> dict[str, float] | None:
+        """Return percentiles of what is remembered and the largest of all values ever, us; None without data."""
+        percentiles = percentiles_us(self.values)
+        return percentiles and {**percentiles, "max": round(self._largest / 1e3, 1)}
 
 
 class TickStatistics:
-    """Takes tick records in any portions. Percentiles are of the latest ten minutes and more, counts of all ticks."""
+    """Takes tick records in any portions. Percentiles are of the latest `REMEMBERED`, counts and maxima of all."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -84,6 +87,6 @@ class TickStatistics:
             "servo_hz": round((self.ticks - 1) / elapsed * 1e9, 2) if elapsed > 0 else 0.0,
             "overruns": self.overruns,
             "dropped": self.dropped,
-            "tick_us": percentiles_us(self._durations.values),
-            "lateness_us": percentiles_us(self._lateness.values),
+            "tick_us": self._durations.report_us(),
+            "lateness_us": self._lateness.report_us(),
         }

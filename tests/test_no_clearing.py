@@ -48,9 +48,9 @@ def _inside(node: ast.AST, function: str) -> Iterator[tuple[str, ast.AST]]:
 
 def test_nobody_calls_the_function_that_clears_faults() -> None:
     arms = {(f"hal/can/{protocol}/arm.py", "clear_faults") for protocol in ("damiao", "cia402")}
-    joined = {("hal/can/damiao/passenger.py", "clear"), ("hal/can/joined.py", "clear_faults")}
-    assert mentions("clear_faults") == arms | joined
-    # The gripper's, and those of several arms in one, are called with the arm's, which nobody calls.
+    # Those of several arms are called with the joined one's, the gripper's with its arm's, and those nobody calls.
+    joined = ("hal/can/joined.py", "clear_faults")
+    assert mentions("clear_faults") == {*arms, joined, ("hal/can/damiao/passenger.py", "clear")}
     assert mentions("clear") & {(file, "clear_faults") for file, _ in arms} == {
         ("hal/can/cia402/arm.py", "clear_faults")
     }

@@ -77,7 +77,7 @@ def test_treacherous_policies_end_with_status_3_and_a_black_box(tmp_path: Path, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--robot", "pander"], ["unknown robot 'pander'", "kinova, openarm, panda, xarm7"]),
+        (["--robot", "pander"], ["unknown robot 'pander'", "kinova, openarm, openarm_bimanual, panda, xarm7"]),
         (["--task", "juggle"], ["unknown task 'juggle'", "reach"]),
         (["--policy", "magic"], ["unknown policy 'magic'", "scripted"]),
         (["--backend", "ros"], ["unknown backend 'ros'", "can, sim"]),

@@ -62,8 +62,8 @@ def test_a_killed_control_process_ends_the_run_as_lost_hardware(start: Any, mome
     assert run.left_behind() == []
 
 
-def test_a_policy_that_comes_back_in_time_goes_on(start: Any) -> None:
-    run = start("--policy", "random", "--episodes", "1")
+def test_a_policy_that_comes_back_in_time_goes_on(start: Any, brief: tuple[str, str]) -> None:
+    run = start("--policy", "random", "--episodes", "1", *brief)
     pids = run.wait_running()
     os.kill(pids["policy"], signal.SIGSTOP)
     time.sleep(0.3)

@@ -14,10 +14,12 @@ from .conftest import PATIENT
 pytestmark = pytest.mark.realtime
 
 
-def test_bad_weights_cost_an_episode_and_the_run_goes_on_with_the_old_ones(start: Any, tmp_path: Path) -> None:
-    robot, path = load_robot("panda", [PATIENT]), tmp_path / "policy.npz"
+def test_bad_weights_cost_an_episode_and_the_run_goes_on_with_the_old_ones(
+    start: Any, brief: tuple[str, str], tmp_path: Path
+) -> None:
+    robot, path = load_robot("panda", PATIENT), tmp_path / "policy.npz"
     untrained(robot, 0).save(path)
-    run = start("--policy", str(path), "--episodes", "3")
+    run = start("--policy", str(path), "--episodes", "3", *brief)
     run.wait_running()
     bad = untrained(robot, 1)
     bad.weights.layers[0][1][0] = np.inf
@@ -25,7 +27,7 @@ def test_bad_weights_cost_an_episode_and_the_run_goes_on_with_the_old_ones(start
     status, output, report = run.finish()
     assert status == 0, output
     assert "refused  P26" in output
-    assert [episode["steps"] for episode in report["episodes"]] == [150, 0, 150]
+    assert [episode["steps"] for episode in report["episodes"]] == [60, 0, 60]
     assert [entry["protection"] for entry in report["safety"]["refused"]] == ["P26"]
     assert report["safety"]["trips"] == []
     assert report["safety"]["violations"] == {"position": 0, "velocity": 0, "sphere": 0}

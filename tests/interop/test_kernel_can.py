@@ -18,7 +18,6 @@ def host_has_vcan() -> bool:
     return Path("/sys/class/net/vcan0").exists()
 
 
-@pytest.mark.realtime
 @pytest.mark.timeout(BOOT_AND_TESTS_S + 15)
 def test_socketcan_of_a_real_kernel(tmp_path: Path) -> None:
     if host_has_vcan():

@@ -127,6 +127,20 @@ def test_drives_are_dead_when_the_last_one_has_been_silent_for_too_long(panda: R
     assert check.dead is dead
 
 
+def test_joints_behind_a_lost_bus_are_not_waited_for_and_the_others_are(panda: Robot):
+    check = FeedbackAge(panda)
+    now = 10**9
+    stamps = np.full(7, now)
+    stamps[[1, 5]] = 0
+    assert check.check(sample(np.zeros(7), stamps=stamps, cut_off=(1, 5)), now) is None
+    assert (check.stale, check.lost, check.dead) == (False, False, False)
+    assert stamps[1] == 0
+    stamps[3] = 0
+    trip = check.check(sample(np.zeros(7), stamps=stamps, cut_off=(1, 5)), now)
+    assert trip is not None
+    assert panda.profile.joints[3].name in trip.cause
+
+
 @pytest.mark.parametrize("key", ["position_breach", "sphere_breach"])
 def test_thresholds_come_from_the_profile(key):
     """At a distance of 0.4 both trip by default, and none with a threshold of 0.5."""

@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from robotctl.hal.can.bus_ids import tag
 from robotctl.hal.can.damiao.codec import (
     BROADCAST_ID,
     MitCommand,
@@ -19,7 +20,7 @@ from robotctl.hal.can.damiao.codec import (
 from robotctl.hal.can.damiao.motors import MOTORS
 from robotctl.hal.can.damiao.registers import Register
 from robotctl.hal.robot import load_robot
-from robotctl.safety.asked import Kind
+from robotctl.safety.asked import Kind, stranger
 from robotctl.safety.wire_guard import WireGuard
 
 ROBOTS = [load_robot(name) for name in ("panda", "openarm")]
@@ -193,3 +194,9 @@ def test_an_arm_without_drives_has_no_frames():
     assert wire.joints == []
     assert wire.kind(1, MOTION) is None
     assert wire.kind(BROADCAST_ID, encode_register(1, RegisterCommand.READ)) is None
+
+
+def test_a_stranger_is_told_with_its_bus_where_there_are_several():
+    data = bytes([1, 2])
+    assert stranger(0x123, data) == "frame 123#0102 is not on the list of this arm"
+    assert stranger(tag(1, 0x123), data) == "frame 123#0102 is not on the list of this arm, bus 1"
