@@ -13,7 +13,7 @@ from robotctl.hal.can.damiao.registers import ControlMode, Register
 from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.robot import load_robot
 from robotctl.sim.motors.bench import Bench
-from robotctl.sim.motors.server import BusPort, Server
+from robotctl.sim.motors.server import BusPort, Pace, Server, serve
 
 pytestmark = [pytest.mark.realtime, pytest.mark.filterwarnings("ignore:The 'bustype' argument")]
 
@@ -32,8 +32,9 @@ def bench_and_client() -> Iterator[tuple[Bench, DaMiaoController]]:
     bench = Bench(load_robot("openarm"), clock.now_ns(), fd=False)
     bus = can.Bus(interface="virtual", channel=name)
     over = threading.Event()
-    server = Server(bench, BusPort(name, bus, fd=False), clock)
-    thread = threading.Thread(target=server.serve, args=(over.is_set,))
+    pace = Pace(clock, bench.advance, bench.now_ns)
+    server = Server(bench, BusPort(name, bus, fd=False), pace)
+    thread = threading.Thread(target=serve, args=([server], pace, over.is_set))
     thread.start()
     client = DaMiaoController(channel=name, bustype="virtual")
     yield bench, client
