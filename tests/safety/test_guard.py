@@ -243,6 +243,17 @@ def test_a_tick_has_one_period():
     assert steps(standing().tick(), 1.01) is Protection.ACCELERATION
 
 
+def test_whether_a_motion_has_left_is_known_until_the_next_tick():
+    bench = Bench()
+    assert not bench.guard.passed
+    assert bench.command(position=HOME + 1.0) is not None
+    assert not bench.guard.passed
+    assert bench.command() is None
+    assert bench.guard.passed
+    bench.tick()
+    assert not bench.guard.passed
+
+
 def test_a_second_command_in_the_same_tick_has_no_more_time():
     bench = standing().tick()
     assert steps(bench, 1.0) is None
