@@ -11,8 +11,7 @@ run: .venv/run ## reach three targets on the twin
 
 test: check coverage ## everything that must pass
 	$(BIN)/python -m pytest -q -n 2 -m "not realtime" --ignore=tests/safety
-	$(BIN)/python -m pytest -q -n 2 -m "realtime and not alone"
-	$(BIN)/python -m pytest -q -m alone
+	$(BIN)/python -m pytest -q -m realtime
 
 coverage: .venv/dev ## every branch of safety/ is taken by its own tests
 	$(BIN)/python -m coverage run --source=safety -m pytest -q tests/safety

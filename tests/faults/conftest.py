@@ -27,8 +27,8 @@ MOMENTS = [random.Random(seed).uniform(0.0, 1.5) for seed in range(KILLS)]
 """When to strike, in seconds after a run has got going."""
 JOINTS = 7
 PATIENT = ("safety.overrun_s=0.1", "safety.heartbeat_s=0.2")
-"""Machines that run tests are stalled by their hypervisors, for longer than the 20 ms that a loop may be, and are busy
-with other tests, for longer than the 100 ms that a policy may be."""
+"""Machines that run tests are stalled by their hypervisors, for longer than the 20 ms that a loop may be, and are busy,
+for longer than the 100 ms that a policy may be."""
 ROBOTCTL = [sys.executable, "-m", "robotctl.cli.main"]
 
 

@@ -18,7 +18,7 @@ from robotctl.control.recorded import read_recording
 
 from .conftest import Emulator
 
-pytestmark = [pytest.mark.realtime, pytest.mark.alone]
+pytestmark = pytest.mark.realtime
 
 UNHARMED = {"position": 0, "velocity": 0, "sphere": 0}
 SPIN = """

@@ -12,7 +12,7 @@ import pytest
 
 from .conftest import MOMENTS, Emulator
 
-pytestmark = [pytest.mark.realtime, pytest.mark.alone]
+pytestmark = pytest.mark.realtime
 LOST = re.compile(r"(\S+): ENABLED -> COMMUNICATION_LOST, (\d+) ms after the last frame")
 
 

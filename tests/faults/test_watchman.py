@@ -13,7 +13,7 @@ import pytest
 
 from .conftest import JOINTS, MOMENTS, Emulator, Run
 
-pytestmark = [pytest.mark.realtime, pytest.mark.alone]
+pytestmark = pytest.mark.realtime
 
 DRIVE_WATCHDOG_S = 0.1
 RUN = ("--backend", "can", "--policy", "random", "--episodes", "4")
