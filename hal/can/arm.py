@@ -105,7 +105,7 @@ class CanArm(Arm):
 
     def connect(self) -> None:
         if not self._open:
-            self._use(open_channel(self._name, self._robot, self._clock))
+            self.connect_to(open_channel(self._name, self._robot, self._clock))
 
     def connect_to(self, channel: Channel) -> None:
         """As `connect`, on a channel that is open already.
@@ -113,7 +113,25 @@ class CanArm(Arm):
         Raises:
             ConfigError: as `connect` does; the channel is shut down then.
         """
-        self._use(channel)
+        if isinstance(self._clock, VirtualClock) and not channel.simulated:
+            channel.bus.shutdown()
+            raise ConfigError(
+                f"the drives behind {self._name!r} live in real time, which lockstep outruns: they would move too fast",
+                "leave out --fast, or use --channel emulated",
+            )
+        profile = self._robot.profile
+        try:
+            require_bandwidth(self._name, profile.drives, profile.servo_hz, self._can, channel.fd)
+        except ConfigError:
+            channel.bus.shutdown()
+            raise
+        transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
+        if self._inspector is not None:
+            transport.inspector = self._inspector.frames
+        transport.tap = self._tap
+        self._channel, self._transport = channel, transport
+        self._verified = self._enabled = False
+        self._attach(transport)
 
     def take_over(self, command: Command) -> None:
         """Take drives that another process had enabled; see `Arm.take_over`.
@@ -124,7 +142,7 @@ class CanArm(Arm):
         """
         if not is_shared(self._name):
             super().take_over(command)
-        self._use(reopen_channel(self._name, self._robot, self._clock))
+        self.connect_to(reopen_channel(self._name, self._robot, self._clock))
         self._verified = self._enabled = True
         self._take_over(command)
 
@@ -220,24 +238,3 @@ class CanArm(Arm):
             return None
         missed = {drive.name: drive.missed for drive in drives}
         return {**self._transport.statistics(), "missed_replies": sum(missed.values()), "missed_by_joint": missed}
-
-    def _use(self, channel: Channel) -> None:
-        if isinstance(self._clock, VirtualClock) and not channel.simulated:
-            channel.bus.shutdown()
-            raise ConfigError(
-                f"the drives behind {self._name!r} live in real time, which lockstep outruns: they would move too fast",
-                "leave out --fast, or use --channel emulated",
-            )
-        profile = self._robot.profile
-        try:
-            require_bandwidth(self._name, profile.drives, profile.servo_hz, self._can, channel.fd)
-        except ConfigError:
-            channel.bus.shutdown()
-            raise
-        transport = Transport(channel, self._clock, self._can.bitrate, self._can.data_bitrate)
-        if self._inspector is not None:
-            transport.inspector = self._inspector.frames
-        transport.tap = self._tap
-        self._channel, self._transport = channel, transport
-        self._verified = self._enabled = False
-        self._attach(transport)

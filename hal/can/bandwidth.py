@@ -1,8 +1,10 @@
-"""Whether a servo rate fits on a bus: every drive takes a command and gives a reply in every period."""
+"""How long frames take on the wire, and whether a servo rate fits on a bus.
+
+Every drive takes a command and gives a reply in every period.
+"""
 
 from collections.abc import Sequence
 
-from robotctl.hal.can.transport import frame_time_ns
 from robotctl.hal.errors import ConfigError
 from robotctl.hal.profile import CLASSIC_HZ, AnyDrive, CanBus, Cia402Drive
 
@@ -12,6 +14,15 @@ HIGHEST_LOAD = 0.9
 _PDO_BITS = (125, 115, 135, 105)
 """Of RPDO1, RPDO2, TPDO1 and TPDO2 of a CiA 402 drive (7, 6, 8 and 5 bytes) at the worst of bit stuffing."""
 _SYNC_BITS = 55
+
+
+def frame_time_ns(fd: bool, bitrate: int, data_bitrate: int) -> float:
+    """Return the time on the wire of one frame of 8 bytes, standard id, worst-case bit stuffing.
+
+    Classic: 135 bits. FD: about 43 bits of arbitration and end at the nominal rate, 110 at the data rate (65 us at
+    1M/5M).
+    """
+    return 43e9 / bitrate + 110e9 / data_bitrate if fd else 135e9 / bitrate
 
 
 def cycle_s(drives: Sequence[AnyDrive], wiring: CanBus, fd: bool) -> float:

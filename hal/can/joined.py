@@ -6,6 +6,7 @@ where they have no brakes. Only when the last bus is gone is there nothing left 
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import can
@@ -137,7 +138,7 @@ class JoinedArm(Arm):
 
     def read(self) -> Sample:
         for bus, arm in enumerate(self.arms):
-            self.attempt(bus, lambda bus=bus, arm=arm: self._read(bus, arm))  # type: ignore[misc]
+            self.attempt(bus, partial(self._read, bus, arm))
         samples = [sample for sample in self._samples if sample is not None]
         if len(samples) < len(self.arms):
             raise BusError(next(filter(None, self.lost)), _REMEDY)
@@ -178,9 +179,9 @@ class JoinedArm(Arm):
                 return Sent(command, f"not sent: {refusal}", delivered=False)
             for bus, frames in cycles.items():
                 self._gates[bus].judged = frames
-        sent = []
+        sent: list[Sent] = []
         for bus, frames in cycles.items():
-            self.attempt(bus, lambda bus=bus, frames=frames: sent.append(self.arms[bus].send(parts[bus], frames)))  # type: ignore[misc]
+            self.attempt(bus, partial(self._send, bus, parts[bus], frames, sent))
         return self._sent(command, sent)
 
     def hold(self) -> Sent:
@@ -242,6 +243,9 @@ class JoinedArm(Arm):
 
     def _read(self, bus: int, arm: DamiaoArm) -> None:
         self._samples[bus] = arm.read()
+
+    def _send(self, bus: int, part: Command, frames: Sequence[tuple[int, bytes]], sent: list[Sent]) -> None:
+        sent.append(self.arms[bus].send(part, frames))
 
     def _fault(self, bus: int) -> Fault:
         hint = f"{self._names[bus]}: {self.lost[bus]}; check adapter and cable, connect again"

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import can
 
+from robotctl.hal.can.bandwidth import frame_time_ns
 from robotctl.hal.can.channel import Channel
 from robotctl.hal.can.error_frames import ErrorLog
 from robotctl.hal.can.outbox import prove_empty
@@ -373,15 +374,6 @@ def route_key(reply_id: int, motor: int) -> int:
     The nibble counts since drives leave the factory with one and the same reply id.
     """
     return reply_id << 4 | motor & 0xF
-
-
-def frame_time_ns(fd: bool, bitrate: int, data_bitrate: int) -> float:
-    """Return the time on the wire of one frame of 8 bytes, standard id, worst-case bit stuffing.
-
-    Classic: 135 bits. FD: about 43 bits of arbitration and end at the nominal rate, 110 at the data rate (65 us at
-    1M/5M).
-    """
-    return 43e9 / bitrate + 110e9 / data_bitrate if fd else 135e9 / bitrate
 
 
 def _stamp(now: int, wall: float, timestamp: float) -> int:

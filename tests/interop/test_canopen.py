@@ -2,11 +2,9 @@
 
 import itertools
 import struct
-import threading
 import time
 from collections.abc import Callable, Iterator
 
-import can
 import canopen
 import numpy as np
 import pytest
@@ -20,7 +18,8 @@ from robotctl.hal.errors import DriveError
 from robotctl.hal.robot import Robot, load_robot
 from robotctl.hal.types import Command, CommandMode
 from robotctl.sim.motors.bench import Bench
-from robotctl.sim.motors.server import BusPort, Pace, Server, serve
+
+from .conftest import served
 
 pytestmark = pytest.mark.realtime
 
@@ -139,29 +138,18 @@ def test_our_driver_brings_up_leads_and_switches_off_their_drives(xarm7: Robot) 
 
 
 @pytest.fixture
-def served(xarm7: Robot) -> Iterator[tuple[str, Bench]]:
-    """Our emulated drives, in real time, on a bus that others reach."""
-    name = f"ours{next(_numbers)}"
-    clock = MonotonicClock()
-    bench = Bench(xarm7, clock.now_ns())
-    bus = can.Bus(interface="virtual", channel=name)
-    over = threading.Event()
-    pace = Pace(clock, bench.advance, bench.now_ns)
-    server = Server(bench, BusPort(name, bus, fd=False), pace)
-    thread = threading.Thread(target=serve, args=([server], pace, over.is_set))
-    thread.start()
-    yield name, bench
-    over.set()
-    thread.join()
-    bus.shutdown()
+def ours(xarm7: Robot) -> Iterator[tuple[str, Bench]]:
+    """Our drives in real time: their channel and their bench."""
+    with served(xarm7) as channel_and_bench:
+        yield channel_and_bench
 
 
 def test_their_client_leads_our_drive_through_its_states(
-    served: tuple[str, Bench], monkeypatch: pytest.MonkeyPatch
+    ours: tuple[str, Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for timeout in ("RESET_FAULT", "SWITCH_OP_MODE", "SWITCH_STATE_FINAL", "SWITCH_STATE_SINGLE", "CHECK_TPDO"):
         monkeypatch.setattr(BaseNode402, f"TIMEOUT_{timeout}", _PATIENCE_S)
-    name, bench = served
+    name, bench = ours
     drive = bench.drive("joint1")
     network = canopen.Network()
     network.connect(interface="virtual", channel=name)
@@ -194,8 +182,8 @@ def test_their_client_leads_our_drive_through_its_states(
         network.disconnect()
 
 
-def test_their_client_maps_pdos_of_our_drive_only_before_it_is_operational(served: tuple[str, Bench]) -> None:
-    name, bench = served
+def test_their_client_maps_pdos_of_our_drive_only_before_it_is_operational(ours: tuple[str, Bench]) -> None:
+    name, bench = ours
     network = canopen.Network()
     network.connect(interface="virtual", channel=name)
     try:

@@ -1,25 +1,21 @@
 """The `damiao-motor` package as the other side: its client drives our emulated drives, as it would drive real ones."""
 
-import itertools
-import threading
 import time
 from collections.abc import Callable, Iterator
 
-import can
 import pytest
 from damiao_motor import DaMiaoController
 
 from robotctl.hal.can.damiao.registers import ControlMode, Register
-from robotctl.hal.clock import MonotonicClock
 from robotctl.hal.robot import load_robot
 from robotctl.sim.motors.bench import Bench
-from robotctl.sim.motors.server import BusPort, Pace, Server, serve
+
+from .conftest import served
 
 pytestmark = [pytest.mark.realtime, pytest.mark.filterwarnings("ignore:The 'bustype' argument")]
 
 ELBOW, WRIST = "openarm_right_joint4", "openarm_right_joint7"
 
-_numbers = itertools.count()
 _PATIENCE_S = 5.0
 _CYCLE_S = 0.01
 
@@ -27,21 +23,10 @@ _CYCLE_S = 0.01
 @pytest.fixture
 def bench_and_client() -> Iterator[tuple[Bench, DaMiaoController]]:
     """Our drives in real time, and their client, on one bus."""
-    name = f"theirs{next(_numbers)}"
-    clock = MonotonicClock()
-    bench = Bench(load_robot("openarm"), clock.now_ns(), fd=False)
-    bus = can.Bus(interface="virtual", channel=name)
-    over = threading.Event()
-    pace = Pace(clock, bench.advance, bench.now_ns)
-    server = Server(bench, BusPort(name, bus, fd=False), pace)
-    thread = threading.Thread(target=serve, args=([server], pace, over.is_set))
-    thread.start()
-    client = DaMiaoController(channel=name, bustype="virtual")
-    yield bench, client
-    client.shutdown()
-    over.set()
-    thread.join()
-    bus.shutdown()
+    with served(load_robot("openarm")) as (name, bench):
+        client = DaMiaoController(channel=name, bustype="virtual")
+        yield bench, client
+        client.shutdown()
 
 
 def repeat(action: Callable[[], None], until: Callable[[], bool]) -> bool:

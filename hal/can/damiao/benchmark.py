@@ -51,10 +51,10 @@ def bench_bus(robot: Robot, clock: Clock, channel: Channel, cycles: int) -> dict
     wiring = robot.profile.can
     if wiring is None:
         raise ConfigError(f"robot {robot.profile.name!r} has no CAN drives", "use a robot with drives")
-    transport = Transport(channel, clock, wiring.bitrate, wiring.data_bitrate)
-    wirings = [drive for drive in robot.profile.drives if isinstance(drive, DamiaoDrive) and drive.bus == 0]
     if robot.profile.protocol != "damiao":
         raise ConfigError(f"robot {robot.profile.name!r} has other drives than DAMIAO's", "use a robot with those")
+    transport = Transport(channel, clock, wiring.bitrate, wiring.data_bitrate)
+    wirings = [drive for drive in robot.profile.drives if isinstance(drive, DamiaoDrive) and drive.bus == 0]
     drives = [
         Drive(f"motor {each.id}", each.id, each.reply_id, MOTORS[each.motor], transport, clock) for each in wirings
     ]
@@ -120,7 +120,6 @@ class _Ours:
         self._simulated = transport.simulated
         self._gains = [drive.gains(0.0, 0.0) for drive in drives]
         self._clock = clock
-        self._tap = _Stamps()
 
     def cycle(self) -> int:
         """Return how many ns it took."""
@@ -131,7 +130,7 @@ class _Ours:
 
     def staged(self) -> int:
         """As `cycle`, and note in `stages` (ns) where the time went; noting costs some itself."""
-        tap = self._tap = _Stamps()
+        tap = _Stamps()
         begun = _now()
         frames = self._encode()
         encoded = _now()

@@ -3,7 +3,7 @@
 import pytest
 
 from robotctl.hal.backend import open_backend
-from robotctl.hal.can.bandwidth import cycle_s, highest_hz, require_bandwidth
+from robotctl.hal.can.bandwidth import cycle_s, frame_time_ns, highest_hz, require_bandwidth
 from robotctl.hal.can.channel import Channel
 from robotctl.hal.clock import VirtualClock
 from robotctl.hal.errors import ConfigError
@@ -69,3 +69,8 @@ def test_at_half_the_rate_classic_can_will_do():
     arm.connect()
     arm.verify()
     arm.close()
+
+
+def test_frame_times():
+    assert frame_time_ns(False, 1_000_000, 0) == pytest.approx(135e3)
+    assert frame_time_ns(True, 1_000_000, 5_000_000) == pytest.approx(65e3)

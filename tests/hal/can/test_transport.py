@@ -10,7 +10,7 @@ import can
 import pytest
 
 from robotctl.hal.can.channel import Channel
-from robotctl.hal.can.transport import DRAIN_LIMIT, FAILING_LIMIT_NS, Transport, frame_time_ns, route_key
+from robotctl.hal.can.transport import DRAIN_LIMIT, FAILING_LIMIT_NS, Transport, route_key
 from robotctl.hal.clock import MonotonicClock, VirtualClock
 from robotctl.hal.errors import BusError
 
@@ -229,11 +229,6 @@ def test_load_is_measured(transport, bus, clock):
         clock.sleep_until(clock.now_ns() + 2_000_000)
         transport.drain()
     assert transport.statistics()["load"] == pytest.approx(0.52, abs=0.01)
-
-
-def test_frame_times():
-    assert frame_time_ns(False, 1_000_000, 0) == pytest.approx(135e3)
-    assert frame_time_ns(True, 1_000_000, 5_000_000) == pytest.approx(65e3)
 
 
 def test_round_trip_percentiles(transport):
